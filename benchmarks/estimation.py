@@ -38,7 +38,7 @@ class Endless:
     path: Path = Path("an hour")
     sha256: str = "0" * 64
     joint_names: tuple[str, ...] = ()
-    torque_held: bool = False
+    torque_zero_order_hold: bool = False
     torn: bool = False
 
     @property

@@ -50,7 +50,7 @@ class ArmDescription:
     """Describe an open arm: joints, rate, limits, resolutions and identities.
 
     Attributes:
-        joint_names: in the order of every vector.
+        joint_names: names of the joints, in the order of every vector.
         rate: cycles per second.
         torque_limit: clip of the driver [N m or N], shape (joints,).
         torque_resolution: smallest step of the torque [N m or N], shape (joints,); 0 where continuous.
@@ -59,13 +59,14 @@ class ArmDescription:
         software: name and version of the driver.
         scheduled_stamps: whether stamps are those of a schedule, whole periods apart, as of a plant that moves by whole
             periods; how late a cycle came only the loop's clock says then. Otherwise stamps are the clock's.
-        lost_cycles: in a row, without an axis' position, after which it counts as gone.
+        lost_cycles: number of cycles in a row without an axis' position after which the axis counts as gone.
         streams_position: whether drives close the position loop: `exchange_position` is what moves the arm, and
             `Sample.torque` is what they measured last, in place of what they are given.
-        watchdog: after how long without its host the slowest drive gives up torque [s]; None where unknown, or where
+        watchdog: time without its host after which the slowest drive gives up torque [s]; None where unknown, or where
             `Arm.watchdogs` says it of each drive.
-        report_delay: how much later than it happens a change of a drive's status may show in a sample [s].
-        delay_cycles: from a sample to the torque that is computed from it; 1 where a torque acts from the next stamp.
+        report_delay: longest delay with which a change of a drive's status shows in a sample [s].
+        delay_cycles: delay from a sample to the torque that is computed from it [cycles]; 1 where a torque acts from
+            the next stamp.
     """
 
     joint_names: tuple[str, ...]
@@ -91,23 +92,23 @@ class Sample:
         cycle: number of the cycle since `open`.
         stamp_ns: monotonic time at which the positions were sampled [ns] (of the request, not of the replies).
         position: [rad or m], shape (joints,).
-        velocity: measured by the drive [rad/s or m/s], shape (joints,), or None where the drive gives none.
+        velocity: velocity measured by the drive [rad/s or m/s], shape (joints,), or None where the drive gives none.
         torque: the torque that acts from this stamp to the next one, clipped and quantised [N m or N], (joints,).
-        valid: which axes' positions are of this cycle, shape (joints,).
+        valid: mask of the axes whose positions are of this cycle, shape (joints,).
         age: how many cycles old each position is, shape (joints,); 0 where `valid`.
         lost: frames lost since `open`.
         status: slow per-axis status words, with `status_age` cycles since they were read.
-        events: of the bus since the sample before.
+        events: events of the bus since the sample before.
         drives: status of each drive in words of its fieldbus, for people; empty where there is nothing to add
             to `status`.
-        measured_torque: measured by the drives until this stamp [N m or N], shape (joints,), NaN where none reported in
-            this cycle; None where none ever did.
-        stamp_doubt_ns: by how much before `stamp_ns` they may have been sampled [ns], where the computer stalled
-            between the request and its stamp; else 0.
-        torque_difference: by how much the drives' last reports exceed the torque they were told [N m or N], shape
+        measured_torque: torque measured by the drives until this stamp [N m or N], shape (joints,), NaN where none
+            reported in this cycle; None where none ever did.
+        stamp_doubt_ns: time before `stamp_ns` at which the positions may have been sampled [ns], where the computer
+            stalled between the request and its stamp; else 0.
+        torque_difference: excess of the drives' last reported torque over the torque they were told [N m or N], shape
             (joints,), less what a healthy drive may deviate; None where nothing is to be compared.
-        joint_position: by encoders behind the transmission, which have the motors' positions where the arm was opened
-            [rad or m], shape (joints,), NaN for joints without one; None for an arm without any.
+        joint_position: position measured by encoders behind the transmission, which have the motors' positions where
+            the arm was opened [rad or m], shape (joints,), NaN for joints without one; None for an arm without any.
     """
 
     cycle: int
@@ -133,11 +134,11 @@ class Watchdog:
     """Describe how one drive stops by itself when its host is gone.
 
     Attributes:
-        drive: its name, for people.
+        drive: name of the drive, for people.
         kind: the signal it watches: `rpdo_timer` and the like.
-        seconds: how long that may stay away before the drive acts [s]; None where unknown.
-        of_torque: whether it is the torque frames, so that a cycle without torque withholds it.
-        report_delay: how much later its reaction may show while its signal is withheld [s]; None where that is
+        seconds: time for which that signal may stay away before the drive acts [s]; None where unknown.
+        of_torque: whether that signal is the torque frames, so that a cycle without torque withholds it.
+        report_delay: longest delay with which its reaction shows while its signal is withheld [s]; None where that is
             `ArmDescription.report_delay`.
     """
 
@@ -154,9 +155,9 @@ class SetupCheck:
 
     Attributes:
         what: the value, and whose it is: `IPNM of puck 3`.
-        found: what the drive says, in words.
-        expected: what it must say; empty where it is only told.
-        remedy: what to do where the two differ.
+        found: value or state that the drive reports, in words.
+        expected: required value or state; empty where it is only told.
+        remedy: remedy where the two differ.
     """
 
     what: str
@@ -310,8 +311,9 @@ class Arm(ABC):
         """Exchange one cycle with all axes: send the torque, return the sample.
 
         Args:
-            torque: to act from this cycle's stamp on [N m or N], shape (joints,); None reads without a torque, and is
-                the only value an arm that is not enabled accepts; on an enabled arm it lets the last torque act on.
+            torque: torque that acts from this cycle's stamp on [N m or N], shape (joints,); None reads without a
+                torque, and is the only value an arm that is not enabled accepts; on an enabled arm it lets the last
+                torque act on.
 
         Returns:
             The sample of this cycle.
@@ -325,7 +327,7 @@ class Arm(ABC):
         """Exchange one cycle with axes that close the position loop by themselves: send positions, return the sample.
 
         Args:
-            position: where each joint shall be one cycle from here [rad or m], shape (joints,).
+            position: position of each joint one cycle from here [rad or m], shape (joints,).
 
         Returns:
             The sample of this cycle; its torque is the one measured last.

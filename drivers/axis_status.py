@@ -50,7 +50,7 @@ class AxisEvent:
 
     Attributes:
         code: of the event.
-        axis: concerned, by the order of the joints; None for the bus or the host.
+        axis: concerned axis, by the order of the joints; None for the bus or the host.
         words: one sentence's middle, for people, that names the drive itself.
     """
 

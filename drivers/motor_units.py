@@ -40,9 +40,9 @@ class Coordinates:
     Attributes:
         joint_per_count: position [rad or m] per count of each motor, shape (n joints, n motors).
         torque_per_count: joint torque [N m or N] per count of each motor, shape (n joints, n motors).
-        count_per_torque: its inverse, shape (n motors, n joints).
+        count_per_torque: inverse of `torque_per_count`, shape (n motors, n joints).
         offset: position of the joints where all counts are `zero`, shape (n,).
-        zero: counts of the motors there; whole numbers, any size.
+        zero: counts of the motors at that position; whole numbers, any size.
         limit: most counts of torque that each motor may be asked for, either way.
         groups: motors that share joints, and the joints they share, by number.
     """
@@ -110,7 +110,7 @@ class Coordinates:
         """Return coordinates for an arm whose motors are at these counts while its joints are at this position.
 
         Args:
-            counts: of the motors, one each.
+            counts: counts of the motors, one each.
             position: of the joints [rad or m], shape (n,).
         """
         return replace(self, zero=tuple(counts), offset=np.array(position, dtype=float))
@@ -158,7 +158,7 @@ def motor_coordinates(
         transmission: the arm's.
         counts_per_turn: of each motor's encoder.
         newton: torque that each motor really gives for one count of torque [N m].
-        most: counts of torque that each motor may be asked for, either way.
+        most: largest counts of torque that each motor may be asked for, either way.
 
     Raises:
         DriverError: not as many motors as ratios.
@@ -192,8 +192,8 @@ def unwrapped(before: int, counts: int, bits: int = 32) -> int:
 
     Args:
         before: the last position, unwrapped [counts].
-        counts: present position of the drive, a signed number of so many bits.
-        bits: after which the drive's counter comes round.
+        counts: present position of the drive [counts], a signed number of so many bits.
+        bits: number of bits of the drive's counter.
     """
     turn = 1 << bits
     return before + (counts - before + turn // 2) % turn - turn // 2

@@ -364,7 +364,7 @@ class ExactBlock:
     """One condition on link parameters.
 
     Attributes:
-        name: what it says, for people.
+        name: name of the condition, for people.
         size: rows of the symmetric matrix that must be positive definite; 0 for a list of numbers.
         entries: the numbers, or the matrix's upper triangle, column by column.
     """
@@ -387,8 +387,8 @@ def set_blocks(kind: Kind, link: int) -> ExactBlock:
     It is written down here a second time, from the formulas, so that a proof does not rest on the solver's arrays.
 
     Args:
-        kind: which of the two.
-        link: its number, counted from 1.
+        kind: kind of the condition.
+        link: number of the link, from 1.
     """
 
     def parameter(symbol: str, coefficient: Fraction | int = 1) -> Row:
@@ -586,11 +586,11 @@ class Arm:
         name: of the arm.
         sha256: of the description; None where no file can name it.
         names: link parameters in the order of delta.
-        units: of them.
+        units: units of these parameters.
         K: per base parameter the coefficients of its expression.
-        blocks: conditions beside the set, which must be positive.
+        blocks: conditions beside the set: matrices or lists of numbers that must be positive.
         equalities: lists of numbers that must be zero.
-        joints: their names in the order of the links; empty where no file can name them.
+        joints: names of the joints in the order of the links; empty where no file can name them.
     """
 
     name: str
@@ -722,7 +722,7 @@ def load(content: str, what: str = "a parameter file") -> dict[str, object]:
 
     Args:
         content: the text.
-        what: it ought to be, for the message.
+        what: description of the file that is expected, for the message.
 
     Raises:
         VerificationError: not JSON, nested too deeply, too long, or a key that stands twice in one object.
@@ -852,7 +852,7 @@ def verify(content: str, arm: Arm | None = None) -> Verification:
 
     Args:
         content: the text of `parameters.json`.
-        arm: whose conditions and expressions those of the file must be; without one, the file's own count.
+        arm: arm whose conditions and expressions the file must have; without one, the file's own count.
     """
     try:
         return _verify(load(content), arm)

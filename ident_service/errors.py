@@ -72,8 +72,8 @@ class Dependent:
 
     Attributes:
         kind: `run`, `motion`, `schedule`, `acceptance`, `identification`, `alarm` or `re-identification`.
-        id: which names it.
-        becomes: what becomes of it when that is deleted all the same.
+        id: id of the dependent.
+        becomes: fate of the dependent when the other is deleted all the same.
     """
 
     kind: str
@@ -146,7 +146,7 @@ def plain_mistake(mistake: Mapping[str, Any]) -> str:
     """Return the message of one mistake that pydantic found, without the pattern of a text, which is for programs.
 
     Args:
-        mistake: of `ValidationError.errors()`: `type`, `msg`, `input` and `ctx`.
+        mistake: one item of `ValidationError.errors()`: `type`, `msg`, `input` and `ctx`.
     """
     if mistake["type"] in BOUNDS:
         words, key = BOUNDS[mistake["type"]]

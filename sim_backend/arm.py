@@ -49,16 +49,16 @@ class SimulatedArm(Arm):
 
         Args:
             plant: body of the arm.
-            imperfections: of encoders and drives.
+            imperfections: imperfections of encoders and drives.
             clock: the loop's.
-            seed: of the torque noise.
-            delay_cycles: from a sample to the first stamp at which a torque computed from it can act; 1 is the
-                contract's, each further one a cycle that torques wait in a queue.
+            seed: seed of the torque noise.
+            delay_cycles: delay from a sample to the first stamp at which a torque computed from it can act [cycles]; 1
+                is the contract's, each further one a cycle that torques wait in a queue.
             watchdog: time without a torque after which enabled drives go idle [s].
             braking: damping of idle axes [N m s/rad or N s/m], shape (joints,); None for none.
             unpowered: damping of axes that are off, as `SimulatedHardware` has it.
-            stand: likewise.
-            faults: to inject, by cycle since `open`.
+            stand: stand that the arm rests on, as `SimulatedHardware` has it; None for none.
+            faults: faults to inject, by cycle since `open`.
             observer: called with the truth of every cycle.
 
         Raises:
@@ -181,7 +181,7 @@ def from_config(
     """Create the arm of a configuration with a simulated driver, at its home position and at rest.
 
     Args:
-        config: its driver's truth, or else its prior, becomes the plant.
+        config: configuration; its driver's truth, or else its prior, becomes the plant.
         clock: the loop's; by default what `driver.time` asks for. A plant in a process of its own moves by the
             machine's clock, or in lock-step with a clock that is.
         faults: to inject besides those of the configuration.

@@ -31,7 +31,7 @@ def build_machine(config: ArmConfig, faults: Sequence[Fault] = ()) -> SimulatedH
     """Build the machine that a configuration describes, at its home position and at rest.
 
     Args:
-        config: its driver's truth, or else its prior, becomes the plant.
+        config: configuration; its driver's truth, or else its prior, becomes the plant.
         faults: to inject besides those of the configuration.
 
     Raises:

@@ -30,7 +30,7 @@ class Fault:
         joint: index of the axis, None for all.
         duration: cycles it lasts; None for one cycle or for good, as `FAULT_RULES` says.
         size: quantity that `FAULT_RULES` defines.
-        offset: of a load, in the frame of the last link [m].
+        offset: offset of a load, in the frame of the last link [m].
     """
 
     at_cycle: int
@@ -63,7 +63,7 @@ def configured_faults(faults: Sequence[SimulatedFault], names: Sequence[str], pe
     """Convert configured faults to cycles and joint numbers.
 
     Args:
-        faults: from the driver section.
+        faults: faults of the driver section.
         names: of the joints.
         period: of the control loop [s].
 
@@ -110,8 +110,8 @@ class Feedback:
         """Start without any answer.
 
         Args:
-            joints: their number.
-            period: of the cycles [s], in which delays are counted.
+            joints: number of joints.
+            period: period of the cycles [s], in which delays are counted.
         """
         # An axis that never answered has no position to repeat.
         self._last = np.full(joints, np.nan)
@@ -129,7 +129,7 @@ class Feedback:
         Args:
             fresh: positions that the encoders show [rad or m], shape (joints,); kept.
             status: status words of the drives, per axis.
-            faults: those active.
+            faults: active faults.
 
         Returns:
             Positions, validity, age and status words as a sample holds them, arrays new and of shape (joints,).

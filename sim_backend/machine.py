@@ -43,7 +43,7 @@ class Schedule:
 
         Args:
             clock: the loop's.
-            period_ns: from cycle to cycle [ns].
+            period_ns: time from cycle to cycle [ns].
             skips: whether periods that are over are skipped, instead of moving the schedule back.
         """
         self._clock = clock
@@ -105,7 +105,7 @@ class Drives:
         acting: torque that a sample says acts from the last stamp on, without noise [N m or N], shape (joints,),
             read-only.
         torque: torque that really acts, where the two differ; as `acting`.
-        damping: of idle axes [N m s/rad or N s/m], shape (joints,), read-only.
+        damping: damping of idle axes [N m s/rad or N s/m], shape (joints,), read-only.
         on: whether the host has energised the drives.
     """
 
@@ -124,7 +124,8 @@ class Drives:
         Args:
             imperfections: clip, steps and noise.
             delay_cycles: 1 for torques that act from the stamp of their cycle on, more to let them wait.
-            noise: draws once per period that the drives are on, if there is noise at all.
+            noise: random generator, of which one draw is taken per period that the drives are on, if there is noise at
+                all.
             braking: damping of an idle axis [N m s/rad or N s/m], shape (joints,).
             watchdog: periods without a torque frame after which the drives go idle.
             unpowered: damping of an axis that is off, and of an idle one after `ramp` periods [N m s/rad or N s/m],
@@ -211,8 +212,9 @@ class Drives:
         """Begin the period from this stamp to the next.
 
         Args:
-            torque: asked for [N m or N], shape (joints,); None asks for the last one again, and is no torque frame.
-            faults: those active.
+            torque: demanded torque [N m or N], shape (joints,); None asks for the last one again, and is no torque
+                frame.
+            faults: active faults.
 
         Returns:
             `acting`.
@@ -294,10 +296,10 @@ class Truth:
 
     Attributes:
         stamp_ns: the sample's stamp [ns], right even where the sample's is not.
-        position: at the stamp, as no encoder sees it [rad or m], shape (joints,).
-        velocity: at the stamp [rad/s or m/s], shape (joints,).
-        acceleration: mean over the period before the stamp [rad/s^2 or m/s^2], shape (joints,).
-        torque: acts from the stamp on, without its noise and without braking [N m or N], shape (joints,).
+        position: true position at the stamp, as no encoder sees it [rad or m], shape (joints,).
+        velocity: true velocity at the stamp [rad/s or m/s], shape (joints,).
+        acceleration: mean acceleration over the period before the stamp [rad/s^2 or m/s^2], shape (joints,).
+        torque: torque that acts from the stamp on, without its noise and without braking [N m or N], shape (joints,).
     """
 
     stamp_ns: int
@@ -325,8 +327,8 @@ class Stand:
     """Support under the posture in which an arm is found, as a person puts it there before anything is energised.
 
     Attributes:
-        sinking: of the joint that sinks farthest until the arm rests on it [rad or m].
-        damping: with which it holds [N m s/rad or N s/m], shape (joints,).
+        sinking: travel of the joint that sinks farthest until the arm rests on it [rad or m].
+        damping: damping with which the stand holds [N m s/rad or N s/m], shape (joints,).
     """
 
     sinking: float
@@ -355,12 +357,12 @@ class SimulatedHardware:
             plant: body of the arm.
             imperfections: of encoders and drives.
             seed: of the torque noise.
-            delay_cycles: from a sample to the first stamp at which a torque computed from it can act.
-            watchdog: of the drives [s].
+            delay_cycles: delay from a sample to the first stamp at which a torque computed from it can act [cycles].
+            watchdog: time without a torque frame after which the drives go idle [s].
             braking: damping of idle axes [N m s/rad or N s/m], shape (joints,); None for no braking.
             unpowered: damping of axes that are off, and of idle ones after a quick stop's ramp [N m s/rad or N s/m],
                 shape (joints,); None for axes that coast when off and are braked while idle.
-            stand: what an arm rests on that nothing holds; None for nothing.
+            stand: stand that an arm rests on that nothing holds; None for none.
             faults: to inject, by period since `restart`.
 
         Raises:

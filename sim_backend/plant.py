@@ -203,7 +203,7 @@ class Plant:
             chain: the mechanism, gravity included.
             layout: order of the parameters.
             delta: true parameters [SI], shape (layout.size,).
-            position: where it starts [rad or m], shape (joints,).
+            position: initial position [rad or m], shape (joints,).
             period: time that `step` advances [s].
 
         Raises:

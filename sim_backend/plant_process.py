@@ -46,8 +46,8 @@ class PlantStatistics:
         """Start, and write the first record.
 
         Args:
-            machine: whose status is recorded.
-            descriptor: of the file or anonymous memory to write into; it is made as long as needed.
+            machine: machine whose status is recorded.
+            descriptor: descriptor of the file or anonymous memory to write into; it is made as long as needed.
         """
         joints = machine.plant.chain.joints
         os.ftruncate(descriptor, status_size(joints))
@@ -158,11 +158,11 @@ class PlantProcess:
         """Use the given machine and socket.
 
         Args:
-            machine: to simulate.
+            machine: machine to simulate.
             listener: bound and listening, non-blocking.
             lifeline: a descriptor that ends with the parent.
-            sha256: of the configuration, which a client must share.
-            story: records the status.
+            sha256: hash of the configuration, which a client must share.
+            story: recorder of the status.
             lock_step: whether exchanges move time, instead of the machine's clock.
         """
         self._machine = machine

@@ -53,11 +53,11 @@ class PlantStatus:
 
     Attributes:
         state: of the process.
-        pid: its process.
+        pid: id of its process.
         client_pid: the process that drives the arm, 0 if none does.
         clients: number of clients so far.
-        ticks: periods the plant has been moved for, whole life.
-        silent_ticks: of these, since the last frame.
+        ticks: number of periods that the plant has been moved for, in its whole life.
+        silent_ticks: number of these periods since the last frame.
         period: of the plant [s].
         position: now, or where it came to rest.
         velocity: now.

@@ -163,7 +163,7 @@ class RemoteArm(Arm):
 
     Attributes:
         observer: called with the truth of every cycle; for scoring only.
-        truth: of the last cycle, None before the first.
+        truth: true state of the last cycle, None before the first.
     """
 
     def __init__(
@@ -177,7 +177,7 @@ class RemoteArm(Arm):
         """Use the arm's description; nothing is started before `open`.
 
         Args:
-            config: with a simulated driver.
+            config: configuration with a simulated driver.
             clock: the loop's; in lock-step with the plant if it is a virtual one.
             faults: to inject besides those of the configuration, by period since the first cycle.
             observer: called with the truth of every cycle.

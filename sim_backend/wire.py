@@ -161,8 +161,8 @@ def encode(frame: Request | Reply, number: int, joints: int) -> bytes:
     """Encode a frame as bytes.
 
     Args:
-        frame: with arrays of shape (joints,).
-        number: of the request that the frame is or answers.
+        frame: frame with arrays of shape (joints,).
+        number: number of the request that the frame is or answers.
         joints: of the arm.
     """
     kind, fields = _KINDS[type(frame)]

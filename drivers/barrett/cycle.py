@@ -78,13 +78,14 @@ class MotorPuck:
     """Hold the last known state of one motor puck.
 
     Attributes:
-        node: its number.
-        position: of the last answer [counts], as a signed number of 22 bits.
-        encoder: of the last answer, the joint encoder's position [counts], likewise; None where it has told none.
-        answered: in this cycle.
+        node: node number.
+        position: position of the last answer [counts], as a signed number of 22 bits.
+        encoder: position of the joint encoder in the last answer [counts], as a signed number of 22 bits; None where it
+            has told none.
+        answered: whether it has answered in this cycle.
         age: cycles since the request that `position` is of, 0 where that is the latest one.
         late: positions that came outside of the cycle that they are of, or second in one.
-        order: which request an answer is of.
+        order: order that tells which request an answer belongs to.
         mode: MODE; None while unknown.
         stat: STAT; None while unknown.
         status_age: cycles since the last answer about MODE.
@@ -129,8 +130,8 @@ class PuckCodec:
 
         Args:
             driver: the section `driver`.
-            motors: properties by which all motor pucks are asked.
-            safety: the safety puck's.
+            motors: numbers of the motor pucks' properties.
+            safety: numbers of the safety puck's properties.
             period: of a cycle [s].
         """
         self.pucks = tuple(MotorPuck(puck.node, order=AnswerOrder(period)) for puck in driver.pucks)
@@ -194,8 +195,8 @@ class PuckCodec:
         """Open a cycle after positions have been asked for: from now on each puck may answer once.
 
         Args:
-            now_ns: when they were [ns of the link's clock].
-            asks: whether they were at all.
+            now_ns: time of the requests [ns of the link's clock].
+            asks: whether positions were asked for at all.
         """
         self._open, self._now_ns, self._missing = True, now_ns, len(self.pucks)
         self.safety.status_age += 1
@@ -350,7 +351,7 @@ class PuckBus:
         clock: of the link.
         complete: whether every puck answered in the last cycle.
         lost: positions that did not come in their cycle, so far.
-        stamp_doubt_ns: of the last cycle, see `Sample`.
+        stamp_doubt_ns: uncertainty of the last cycle's stamp, see `Sample`.
         silent: whether nothing is sent that the safety puck watches, so that it can be seen to act.
         looks: whether positions are asked for only where the arm is not active, as nobody drives it from here.
     """

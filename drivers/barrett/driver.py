@@ -76,7 +76,7 @@ class JointEncoders:
         """Compare whether pucks tell a joint encoder with the description.
 
         Args:
-            pucks: as they have answered.
+            pucks: pucks with their answers.
         """
         remedy = "List the nodes that read one in driver.joint_encoders, with joint_counts; its bits are on the bus."
         words = {True: "told", False: "not told"}
@@ -104,8 +104,8 @@ class JointEncoders:
         """Return joint positions by the encoders, and an event of each joint whose cables they no longer guard.
 
         Args:
-            pucks: at the end of a cycle.
-            position: of the joints by their motors [rad], shape (joints,).
+            pucks: pucks at the end of a cycle.
+            position: position of the joints by their motors [rad], shape (joints,).
 
         Returns:
             Positions by the encoders [rad], shape (joints,), NaN for joints without one; None for an arm without any.
@@ -167,8 +167,8 @@ class BarrettArm(Arm):
         """Use the arm's description; nothing is opened.
 
         Args:
-            config: with a driver of pucks and a transmission.
-            open_bus: gives the link.
+            config: configuration with a driver of pucks and a transmission.
+            open_bus: function that opens the link.
             looks: whether the arm is only looked at: no property is set, and no torque sent.
 
         Raises:

@@ -165,8 +165,8 @@ class Properties:
     """Map the names of a puck's properties to their numbers.
 
     Attributes:
-        version: of its firmware (VERS).
-        role: of the puck (ROLE), without option bits.
+        version: version of its firmware (VERS).
+        role: role of the puck (ROLE), without option bits.
     """
 
     def __init__(self, version: int, role: int) -> None:
@@ -332,7 +332,7 @@ def torque_frame(group: int, number: int, counts: Sequence[int]) -> Frame:
 
     Args:
         group: `Group.LOWER` or `Group.UPPER`.
-        number: of the property T in the pucks' firmware, the same in all of them.
+        number: number of the property T in the pucks' firmware, the same in all of them.
         counts: torque of the pucks by their slots (PIDX); slots that are left out get zero.
 
     Raises:
@@ -378,10 +378,10 @@ class Pendant:
     Attributes:
         warnings: causes that are close to their limits.
         faults: causes that took the arm out of ACTIVE.
-        button: that is pressed.
+        button: button that is pressed.
         activate_light: whether the light of Activate is on.
         idle_light: whether the light of Idle is on.
-        digit: on its display; empty for an unknown one.
+        digit: digit on its display; empty for an unknown one.
     """
 
     warnings: tuple[str, ...] = ()

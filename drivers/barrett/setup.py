@@ -163,10 +163,10 @@ class FoundPuck:
     """Hold what one motor puck reports of itself.
 
     Attributes:
-        puck: its section of the description.
-        properties: of its firmware and role.
+        puck: section of the description for the puck.
+        properties: properties of its firmware and role.
         role: ROLE with its option bits.
-        values: of the properties in `_READ` that its firmware has, by name.
+        values: values of the properties in `_READ` that its firmware has, by name.
     """
 
     puck: Puck
@@ -191,8 +191,8 @@ class FoundArm:
     Attributes:
         pucks: the motor pucks, in the arm's order.
         safety: properties of the safety puck.
-        safety_node: its node.
-        asleep: nodes that are in their monitor.
+        safety_node: node of the safety puck.
+        asleep: nodes in their monitor.
     """
 
     pucks: tuple[FoundPuck, ...]
@@ -210,7 +210,7 @@ def found_on(port: PropertyPort, driver: BarrettDriver, *, wakes: bool = True) -
     """Ask every puck of an arm for what it reports of itself.
 
     Args:
-        port: to the bus.
+        port: port to the bus.
         driver: the section `driver`.
         wakes: whether pucks in their monitor are woken; otherwise nothing is sent but questions.
 
@@ -344,10 +344,10 @@ def zero(port: PropertyPort, arm: FoundArm, coordinates: Coordinates, home: Sequ
     """Define the present position of the arm as its home.
 
     Args:
-        port: to the bus.
-        arm: what the pucks say; the safety puck must not be ACTIVE.
-        coordinates: of the arm, with counts of 0 where the transmission has its zero.
-        home: of the joints [rad or m].
+        port: port to the bus.
+        arm: the pucks' answers; the safety puck must not be ACTIVE.
+        coordinates: coordinates of the arm, with counts of 0 where the transmission has its zero.
+        home: home position of the joints [rad or m].
 
     Returns:
         What was written to each puck, for people.

@@ -25,7 +25,7 @@ class AnswerOrder:
     """Count the requests that one node has not answered.
 
     Attributes:
-        behind: how many, the latest included.
+        behind: number of requests that wait for an answer, the latest included.
         uncertain: whether the last answer may be of an older request, and `settle` is to be called.
     """
 
@@ -43,7 +43,7 @@ class AnswerOrder:
         """Take an answer within its cycle.
 
         Args:
-            delay_ns: since the latest request [ns]; None where it is unknown.
+            delay_ns: time since the latest request [ns]; None where it is unknown.
 
         Returns:
             How many requests ago the one was that it may belong to, 0 where it surely is the latest; None where every
@@ -87,11 +87,11 @@ class AnsweringNode(Protocol):
     """A node that answers each request once, as both kinds of drives do.
 
     Attributes:
-        node: its number.
+        node: node number.
         answered: whether it has answered in this cycle.
         age: cycles since the request that its last answer is of.
         late: answers that did not count for the cycle in which they came.
-        order: which request an answer is of.
+        order: order that tells which request an answer belongs to.
     """
 
     node: int
@@ -106,7 +106,7 @@ def settle_uncertain(nodes: Iterable[AnsweringNode], tell: Callable[[EventCode, 
 
     Args:
         nodes: of one bus.
-        tell: is told of the others, whose answers are late.
+        tell: called with the other nodes, whose answers are late.
 
     Returns:
         How many nodes have answered by this.

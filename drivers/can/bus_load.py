@@ -205,10 +205,10 @@ class Line:
     """Describe the frames of one sort.
 
     Attributes:
-        name: of the sort.
+        name: name of the sort of frames.
         cob_ids: identifiers, one frame each.
         length: bytes of one.
-        per_second: how often each is sent, at most.
+        per_second: largest number of each per second.
         cyclic: whether each is sent once a cycle.
         each: time of one on the wire, intermission included [s]; the mean over `cob_ids`.
     """
@@ -232,7 +232,7 @@ class BusLoad:
 
     Attributes:
         number: of the bus, from 0.
-        bus: its description.
+        bus: description of the bus.
         lines: load of its frames, by sort.
     """
 
@@ -274,7 +274,7 @@ class Budget:
 
     Attributes:
         rate: cycles per second.
-        buses: in the order of the configuration.
+        buses: loads of the buses, in the order of the configuration.
         remedies: changes of which each alone would make the load fit, in words; empty where it fits.
     """
 
@@ -323,12 +323,12 @@ def line_of(
     """Return the cost of the frames of one sort.
 
     Args:
-        name: of the sort.
-        identifiers: of the frames, one each.
+        name: name of the sort of frames.
+        identifiers: identifiers, one for each frame.
         length: bytes of one.
-        per_second: how often each is sent, at most.
-        bus: that they are on.
-        mean: gives the mean bits of a frame by its identifier, at the nominal and at the data bit rate.
+        per_second: largest number of each per second.
+        bus: bus that the frames are on.
+        mean: function that returns the mean bits of a frame by its identifier, at the nominal and at the data bit rate.
         cyclic: whether each is sent once a cycle.
     """
     fd, rates = bus.data_bitrate is not None, (bus.bitrate, bus.data_bitrate)
@@ -344,8 +344,8 @@ def mean_bits(identifier: int, draw: Callable[[random.Random], bytes], *, fd: bo
     """Return the mean bits of a frame over typical contents, at both bit rates; the same on every call.
 
     Args:
-        identifier: of the frame, and the seed.
-        draw: gives the contents of one frame.
+        identifier: identifier of the frame, which seeds the draws, too.
+        draw: function that draws the content of one frame.
         fd: whether it is a CAN FD frame.
     """
     source = random.Random(identifier)  # noqa: S311 - values, not secrets

@@ -66,7 +66,7 @@ class BusError(DriverError):
         Args:
             kind: of the error.
             name: of the bus, as it is configured.
-            bitrate: for the command that brings an interface up.
+            bitrate: bit rate for the command that brings an interface up.
             detail: the system's own word.
             remedy: instead of the usual one, where it does not fit the interface.
         """
@@ -149,7 +149,7 @@ def controller_checks(channel: str, state: ControllerState) -> tuple[SetupCheck,
     """Return the check of a host's controller that is error-passive or bus-off; none of any other.
 
     Args:
-        channel: of the bus, as it is configured.
+        channel: channel of the bus, as it is configured.
         state: of the host's controller on it.
     """
     if state not in LEFT_NORMAL:
@@ -229,8 +229,8 @@ class Event:
 
     Attributes:
         code: of the event.
-        node: that it is about; `HOST` for the bus as a whole.
-        words: for people, without the node.
+        node: node of the event; `HOST` for the bus as a whole.
+        words: description for people, without the node.
     """
 
     code: EventCode

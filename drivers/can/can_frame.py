@@ -27,7 +27,7 @@ class Frame(NamedTuple):
         error: an error frame of the controller, not of the wire; `identifier` holds the error class bits of
             linux/can/error.h and `data` its details.
         extended: a 29-bit identifier, which CANopen never uses.
-        stamp_ns: when it was received, monotonic [ns]; 0 where unknown.
+        stamp_ns: time when it was received, monotonic [ns]; 0 where unknown.
         fd: a CAN FD frame with its bit rate switched. What a driver sends is one where its link's bus is configured so,
             whatever stands here.
     """
@@ -48,7 +48,7 @@ def check_sendable(frame: Frame, *, fd: bool) -> None:
     """Raise DriverError for a frame that no controller would send.
 
     Args:
-        frame: to be sent.
+        frame: frame to be sent.
         fd: whether the bus carries CAN FD frames.
 
     Raises:
@@ -119,8 +119,8 @@ def pack_frames(frames: Iterable[tuple[Frame, bool]]) -> bytes:
     A frame is a header of 16 bytes (stamp [ns], the kernel's identifier word, length, flags) and its data.
 
     Args:
-        frames: at most `MAX_PACKET_FRAMES` that can exist on a bus, each with whether the recipient of the packet sent
-            it.
+        frames: frames that can exist on a bus, at most `MAX_PACKET_FRAMES`, each with whether the recipient of the
+            packet sent it.
     """
     parts = []
     for (identifier, data, remote, error, extended, stamp_ns, fd), own in frames:

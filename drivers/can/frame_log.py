@@ -58,7 +58,7 @@ def logged_links(links: Sequence[Link], path: Path, fd: Sequence[bool]) -> tuple
     Args:
         links: of all buses.
         path: of the file.
-        fd: of which buses data frames are sent as CAN FD's.
+        fd: whether the data frames of each bus are sent as CAN FD's.
 
     Raises:
         DriverError: the file cannot be created; the links are closed then.
@@ -79,8 +79,8 @@ class BusSession:
         """Use the arm's description; nothing is opened.
 
         Args:
-            config: with a driver on CAN buses.
-            open_bus: gives the links, in the order of the buses.
+            config: configuration with a driver on CAN buses.
+            open_bus: function that opens the links, in the order of the buses.
         """
         self._config, self._open_bus = config, open_bus
         self._locks: list[BusLock] = []
@@ -128,15 +128,15 @@ class SessionLog:
     Attributes:
         path: of the file.
         lost: frames that were dropped because the writing process was behind or gone.
-        report: how it ended, None until it has.
+        report: report of the end of the log, None until it has ended.
     """
 
     def __init__(self, path: Path | str, clock: Clock) -> None:
         """Start the writing process and create the file, which must not exist.
 
         Args:
-            path: ends in one of `SUFFIXES`; `.asc` does not keep what kind of error an error frame tells.
-            clock: that stamps are of.
+            path: path, which ends in one of `SUFFIXES`; `.asc` does not keep what kind of error an error frame tells.
+            clock: clock of the stamps.
 
         Raises:
             DriverError: another suffix, or the file cannot be created.
@@ -182,8 +182,8 @@ class SessionLog:
         """Return a link whose frames are logged.
 
         Args:
-            link: of the bus; closed with what is returned.
-            bus: its number in the file.
+            link: link of the bus; closed with the returned link.
+            bus: number of the bus in the file.
             fd: whether data frames are sent as CAN FD's.
         """
         return LoggedLink(link, self, bus, fd)

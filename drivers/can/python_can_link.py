@@ -63,7 +63,7 @@ def open_bus(bus: CanBus, **more: Any) -> can.BusABC:
 
     Args:
         bus: the configured one.
-        more: for python-can, besides the options of the bus.
+        more: further options for python-can, besides those of the bus.
 
     Raises:
         BusError: no such interface, or it cannot be opened.
@@ -107,8 +107,8 @@ class PythonCanLink:
         """Use an open bus, and close it with the link.
 
         Args:
-            bus: opened by `open_bus`; shut down with the link.
-            config: that it was opened from.
+            bus: bus that `open_bus` opened; shut down with the link.
+            config: configuration that the bus was opened from.
         """
         self.clock = RealClock()
         self._bus, self._config = bus, config

@@ -172,7 +172,7 @@ def open_socket(channel: str, bitrate: int = 1_000_000, *, fd: bool = False) -> 
 
     Args:
         channel: network interface, as `ip link` names it.
-        bitrate: for the remedy in messages only; the interface is configured outside.
+        bitrate: bit rate for the remedy in messages only; the interface is configured outside.
         fd: whether CAN FD frames may come and go.
 
     Raises:
@@ -215,7 +215,7 @@ class RawLink:
         Args:
             sock: bound; closed with the link.
             name: of the interface, for messages.
-            bitrate: for messages.
+            bitrate: bit rate for messages.
             fd: whether data frames are sent as CAN FD.
         """
         sock.setblocking(False)

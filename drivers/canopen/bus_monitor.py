@@ -89,9 +89,9 @@ class BusListener:
         """Describe a node's NMT state for people, as of now.
 
         Args:
-            place: bus and node.
-            now_ns: of the links' clock.
-            patience_ns: after which a heartbeat that was there is missed [ns].
+            place: bus and node number.
+            now_ns: present time of the links' clock [ns].
+            patience_ns: time without a heartbeat that was there after which it is missed [ns].
         """
         if place not in self.nmt:
             return "sends no heartbeat"
@@ -138,8 +138,8 @@ class MonitoringArm(Arm):
         """Use the arm's description; nothing is opened.
 
         Args:
-            config: with a CANopen driver and a transmission.
-            open_bus: gives the links, in the order of the buses.
+            config: configuration with a CANopen driver and a transmission.
+            open_bus: function that opens the links, in the order of the buses.
 
         Raises:
             DriverError: the description lacks the driver or the transmission.

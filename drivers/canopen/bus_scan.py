@@ -38,7 +38,7 @@ class FoundNode:
 
     Attributes:
         bus: number of its bus, from 0.
-        node: its number.
+        node: node number.
         nmt: state in words, from its heartbeat.
         answers: whether it answers SDO requests, without which nothing below is known.
         device_type: 1000h.
@@ -76,8 +76,8 @@ def scan(config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_l
     """Return every node that sends heartbeats or answers, by bus and node number.
 
     Args:
-        config: with a CANopen driver.
-        open_bus: gives the links, in the order of the buses.
+        config: configuration with a CANopen driver.
+        open_bus: function that opens the links, in the order of the buses.
 
     Raises:
         DriverError: another driver, a bus that is in use, by another host too, or that cannot be had.
@@ -93,8 +93,8 @@ def asking(
     """Open the buses of an arm exclusively, to ask nodes on them, after a second of listening for heartbeats.
 
     Args:
-        config: with a CANopen driver.
-        open_bus: gives the links, in the order of the buses.
+        config: configuration with a CANopen driver.
+        open_bus: function that opens the links, in the order of the buses.
 
     Raises:
         DriverError: another driver, a bus that is in use, by another host too, or that cannot be had.

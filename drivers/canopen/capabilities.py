@@ -112,10 +112,10 @@ class DriveEntries:
 
     Attributes:
         there: keys (index << 8 | sub-index) of entries that it has.
-        values: of the entries, by key, where known.
-        unread: why one that it seems to have could not be read, by key.
+        values: values of the entries, by key, where known.
+        unread: reason why an entry that it seems to have could not be read, by key.
         asked: whether the drive was asked; else its data sheet foretells.
-        firmware: its software version (100Ah), empty where it does not tell it.
+        firmware: software version of the drive (100Ah), empty where it does not tell it.
     """
 
     there: frozenset[int]
@@ -155,21 +155,21 @@ class Capabilities:
     """Hold what one drive can do, and which of the alternatives are used.
 
     Attributes:
-        family: that it belongs to.
-        found: what it has.
-        torque: how torques are streamed, or positions (`driver.streams`); None for no way.
+        family: drive family that it belongs to.
+        found: entries that the drive has.
+        torque: way in which torques, or positions, are streamed (`driver.streams`); None for no way.
         count: a count of the target [N m]; None where nothing tells it.
-        limit: of the torque, in the drive; None for none.
+        limit: torque limit in the drive; None for none.
         speed: entry of the largest speed; None where the drive has none, or nobody knows its unit.
-        speed_size: how many of its unit a turn per minute is.
-        watchdogs: kinds that it has, the most trusted first.
-        more_trusted: which of them is more trusted than the described one, in words; empty where none is.
+        speed_size: number of its units in a turn per minute.
+        watchdogs: kinds of watchdogs that it has, the most trusted first.
+        more_trusted: name of a watchdog that is more trusted than the described one, in words; empty where none is.
         event: whether it has an event timer for status reports; else they come with every n-th SYNC.
         beside: whether its status is sent with its position.
         dummies: indices of what may take the room of others' torques, in the order in which they are tried.
         shares: whether its data sheet or its family lets it share torque frames.
-        problems: why it cannot be driven.
-        changes: that the description needs, with reasons.
+        problems: reasons why it cannot be driven.
+        changes: changes that the description needs, with reasons.
         notes: missing optional entries, and what happens instead.
     """
 
@@ -241,7 +241,7 @@ def discovered(objects: Objects, drive: CanopenDrive, own: Sequence[Family] = ()
 
     Args:
         objects: of the drive.
-        drive: its section of the description.
+        drive: section of the description for the drive.
         own: families of the description.
 
     Raises:
@@ -311,11 +311,11 @@ def assess(
     """Compare what a drive has with what it needs.
 
     Args:
-        found: what it has.
-        family: that it belongs to.
-        drive: its section of the description.
+        found: entries that the drive has.
+        family: drive family that it belongs to.
+        drive: section of the description for the drive.
         driver: the section that has it.
-        sheet: its data sheet, None where none is known.
+        sheet: data sheet of the drive, None where none is known.
     """
     problems = [Problem(where(entry), f"missing; {why}") for entry, why in _INDISPENSABLE if not found.has(entry)]
     notes = [f"{where(entry)} is missing: {words}" for entry, words in _OPTIONAL if not found.has(entry)]
@@ -440,10 +440,10 @@ def speed_size(entry: Entry, unit: int | None, drive: CanopenDrive) -> float | N
     """Return how many of an entry's unit a turn per minute is; None where nobody knows.
 
     Args:
-        entry: of the largest speed; the largest profile velocity (607Fh) is in the unit of velocities, by CiA 402-2
-            counts per second.
-        unit: what 60A9h says of that, as CiA 303-2 numbers units; None or 0 where it says nothing.
-        drive: its section of the description.
+        entry: entry of the largest speed; the largest profile velocity (607Fh) is in the unit of velocities, by CiA
+            402-2 counts per second.
+        unit: unit of that speed by 60A9h, as CiA 303-2 numbers units; None or 0 where it says nothing.
+        drive: section of the description for the drive.
     """
     if entry.index != od.MAX_VELOCITY.index:
         return 1.0

@@ -58,8 +58,8 @@ def configure_pdos(objects: Objects, pdos: Sequence[Pdo], unused: Sequence[Pdo],
 
     Args:
         objects: of the drive.
-        pdos: that it shall have; slots of other drives are `od.DUMMY_INT16`.
-        unused: that it shall not have; they may be missing.
+        pdos: PDOs that the drive shall have; slots of other drives are `od.DUMMY_INT16`.
+        unused: PDOs that the drive shall not have; they may be missing.
         dummies: indices of dummies that may take the room of others' slots, in the order in which they are tried.
 
     Returns:
@@ -200,9 +200,9 @@ class MotorLimits:
 
     Attributes:
         positions: lowest and highest [counts], for a drive that heeds them; None where joints have none.
-        speed: at which it turns when all joints move at their velocity limits [turns per minute].
+        speed: speed of the motor when all joints move at their velocity limits [turns per minute].
         deceleration: 6085h, in the drive's unit; None where neither the drive's section nor the joints say one.
-        torque: that keeps its joints within their torque limits, whatever the others give [N m].
+        torque: torque that keeps its joints within their torque limits, whatever the others give [N m].
     """
 
     positions: tuple[int, int] | None
@@ -216,12 +216,12 @@ class DriveConfiguration:
     """Hold one drive's part of the configuration.
 
     Attributes:
-        drive: its section of the description.
+        drive: section of the description for the drive.
         profile: of its bus.
-        reactions: to faults that the drive finds by itself.
+        reactions: reactions to faults that the drive finds by itself.
         quick_stop: 605Ah, in place of what `reactions` leaves open.
         motor: the joints' limits converted to this motor.
-        can: its capabilities.
+        can: capabilities of the drive.
     """
 
     drive: CanopenDrive
@@ -308,8 +308,8 @@ def motor_limits(config: ArmConfig, found: Coordinates) -> list[MotorLimits]:
     """Convert the limits of an arm's joints to each of its motors.
 
     Args:
-        config: with a CANopen driver and a transmission.
-        found: its coordinates, of the zero that the drives have.
+        config: configuration with a CANopen driver and a transmission.
+        found: coordinates of the arm with the zero that the drives have.
     """
     driver, gears, joints = config.driver, config.transmission, list(config.joints.values())
     assert isinstance(driver, CanopenDriver)  # noqa: S101 - refused in the beginning
@@ -484,7 +484,7 @@ def disable_supervision(
 
     Args:
         objects: of the drive.
-        zeros: of the arm, None where drives know their position.
+        zeros: zeros of the arm, None where drives know their position.
         number: of the drive.
         restarted: whether it has sent a boot-up message in the session.
 

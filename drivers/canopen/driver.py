@@ -62,13 +62,13 @@ from drivers.canopen.drive_setup import (
     quick_stop_option,
     watchdogs_of,
 )
-from drivers.canopen.homing import ZeroingArm
 from drivers.canopen.motor_units import coordinates, signed
 from drivers.canopen.pdo_codec import BusCodec, Drive, Emergency
 from drivers.canopen.pdo_mapping import Write, bus_profiles
 from drivers.canopen.sdo import Objects, SdoRefused
 from drivers.canopen.stored_zero import zeros_of
 from drivers.canopen.sync_cycle import REPEAT, Buses, EnableSequence, Resetting, hold
+from drivers.canopen.zeroing import ZeroingArm
 from drivers.clock import Clock, RealClock, VirtualClock
 from drivers.motor_units import Coordinates, unwrapped
 from ident_service.config.arm import ArmConfig
@@ -85,7 +85,7 @@ class StopCommand:
     """Hold the last stop command, and the drives that it could not be sent to yet; no method raises.
 
     Attributes:
-        braking: whether it is a quick stop.
+        braking: whether the stop is a quick stop.
     """
 
     def __init__(self) -> None:
@@ -134,7 +134,7 @@ class StopCommand:
 
         Args:
             buses: open.
-            zero: as for `counts`; None where no torque frames are sent.
+            zero: zero torque, as for `counts`; None where no torque frames are sent.
             period_ns: of a cycle [ns].
         """
         for cycle in range(1, max(_FAREWELL, round(_BRAKING * 1e9 / period_ns)) + 1):
@@ -156,11 +156,11 @@ class MeasuredTorque:
     """Collect the torques that the drives of an arm measure.
 
     Attributes:
-        torque: by the newest reports, where one came since the cycle before, else NaN [N m or N], shape (joints,);
-            None where no drive has reported.
-        last: of every joint, the last torque by a report, 0 before the first [N m or N], shape (joints,).
-        difference: how much more than they were told drives measured in their last two reports, the smaller of both
-            [N m or N], shape (joints,); None likewise.
+        torque: torque by the newest reports, where one came since the cycle before, else NaN [N m or N], shape
+            (joints,); None where no drive has reported.
+        last: last reported torque of every joint, 0 before the first report [N m or N], shape (joints,).
+        difference: excess of measured over commanded torque in the last two reports of each drive, the smaller of both
+            [N m or N], shape (joints,); None where no drive has reported.
     """
 
     def __init__(self, coordinates: Coordinates, rate: float, *, compares: bool = True) -> None:
@@ -187,7 +187,7 @@ class MeasuredTorque:
 
         Args:
             counts: sent with its SYNC [per mille of rated torque], by drive.
-            drives: as they are at its end.
+            drives: drives at the end of the cycle.
         """
         if self._compares:
             self._told[self._cycle % len(self._told)] = counts
@@ -225,7 +225,7 @@ def axis_events(events: Iterable[Event], codec: BusCodec, joint_of: Mapping[int,
     """Translate the events of one bus.
 
     Args:
-        events: from the codec. Those of drive states, reset errors and returns to normal are left out.
+        events: events of the codec. Those of drive states, reset errors and returns to normal are left out.
         codec: of the bus.
         joint_of: first joint that each node moves.
     """
@@ -281,7 +281,7 @@ class MissedReports:
 
         Args:
             codec: of the bus.
-            now_ns: of the links' clock [ns].
+            now_ns: present time of the links' clock [ns].
             joint_of: first joint that each node moves.
         """
         bus, profile = codec.profile.number, codec.profile
@@ -307,8 +307,8 @@ class CanopenArm(Arm):
         """Use the arm's description; nothing is opened.
 
         Args:
-            config: with a CANopen driver and a transmission.
-            open_bus: gives the links, in the order of the buses.
+            config: configuration with a CANopen driver and a transmission.
+            open_bus: function that opens the links, in the order of the buses.
 
         Raises:
             DriverError: the description lacks the driver, the transmission, or joints.

@@ -34,8 +34,8 @@ class Entry:
         index: 1000h to 9FFFh; below, the dummies of PDO mapping.
         sub: sub-index.
         kind: type of its value.
-        name: in words.
-        unit: of the value; empty for codes and numbers.
+        name: name in words.
+        unit: unit of the value; empty for codes and numbers.
     """
 
     index: int
@@ -151,7 +151,7 @@ class OperationMode:
     """Represent a mode of operation: the value sent with control words (6060h), and the entry that shows it in effect.
 
     Attributes:
-        sent: in 6060h.
+        sent: value sent in 6060h.
         display: entry that tells the mode in effect.
         wanted: value of `display` in that mode.
         enabling: bits of the control word without which the drive does not follow its target in that mode.

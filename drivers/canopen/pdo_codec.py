@@ -83,26 +83,27 @@ class Drive:
     """Hold the last reported state of one drive.
 
     Attributes:
-        node: its number.
-        position: of the last answer [counts], as a signed number of 32 bits that wraps around.
+        node: node number.
+        position: position of the last answer [counts], as a signed number of 32 bits that wraps around.
         seen: whether it has ever answered.
-        answered: in this cycle.
+        answered: whether it has answered in this cycle.
         age: cycles since the SYNC that `position` is of, 0 where that is the latest one.
-        order: which SYNC an answer is of.
+        order: order that tells which SYNC an answer belongs to.
         answers: positions that were accepted.
         duplicates: positions that came second in a cycle.
         late: positions that came outside of the cycle that they are of.
         status: the last status word (6041h), None before the first.
-        let_go: a status word by which an enabled drive was not enabled any more, since whoever acts upon it has cleared
-            it; a later one that says otherwise does not take it back.
-        torque: the last one that it measured [per mille of rated torque] (6077h).
-        torques: how often that was told.
-        status_age: cycles since it.
+        let_go: status word with which an enabled drive reported that it is not enabled any more; kept, whatever later
+            ones say, until whoever acts upon it clears it.
+        torque: last torque that it measured [per mille of rated torque] (6077h).
+        torques: number of reports of that torque.
+        status_age: number of cycles since the last status word.
         nmt: state of its last heartbeat, None before the first.
-        heartbeat_ns: when that was [ns of the link's clock].
-        boots: boot-up messages.
-        emergency: the latest, None before the first and after a reset.
-        error_passive: whether it has said so of its CAN controller, and not since that it is over.
+        heartbeat_ns: time of that heartbeat [ns of the link's clock].
+        boots: number of boot-up messages.
+        emergency: latest emergency, None before the first and after a reset.
+        error_passive: whether it has reported that its CAN controller is error-passive, and not since that this is
+            over.
         reply: last answer to an SDO request, of any kind; None until one came since whoever asks has cleared it.
         uploads: last value of each entry that it was asked for by one frame, by `index << 8 | sub-index`.
     """
@@ -238,7 +239,7 @@ class BusCodec:
         """Return the frames that carry a torque, or a position, to every drive of this bus.
 
         Args:
-            counts: of all drives of the arm [per mille of rated torque, or counts], in the arm's order.
+            counts: torques of all drives of the arm [per mille of rated torque, or counts], in the arm's order.
 
         Raises:
             DriverError: a value that its bits do not hold, or too few of them; nothing is to be sent then.

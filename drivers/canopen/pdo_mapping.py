@@ -58,7 +58,7 @@ class TorqueFrame:
 
     Attributes:
         cob_id: of the frame.
-        drives: whose targets it carries, in the order of its slots; numbers in the arm's list of drives.
+        drives: indices, in the arm's list of drives, of those whose targets it carries, in the order of its slots.
         nodes: the same drives as node numbers.
         target: entry that each of them takes from it.
         shift: bits by which counts are shifted in it.
@@ -81,13 +81,13 @@ class Pdo:
     """Represent one PDO of one drive as it is to be configured.
 
     Attributes:
-        number: from 1.
-        sent: by the drive (TPDO), else to it (RPDO).
+        number: number of the PDO, from 1.
+        sent: whether the drive sends it (TPDO); otherwise it receives it (RPDO).
         cob_id: of its frame.
         type: transmission type.
         slots: entries that it maps, in order.
         inhibit: least time between two [100 us]; of TPDOs.
-        timer: of a TPDO its event timer, of an RPDO its deadline [ms]; 0 for none.
+        timer: event timer of a TPDO, or deadline of an RPDO [ms]; 0 for none.
     """
 
     number: int
@@ -149,21 +149,22 @@ class BusProfile:
 
     Attributes:
         number: of the bus, from 0.
-        bus: its section of the configuration.
+        bus: section of the configuration for the bus.
         rate: cycles per second.
         host: node number of the host.
-        drives: which of the arm's drives are on it, in the arm's order.
+        drives: indices of the arm's drives that are on it, in the arm's order.
         nodes: the same drives as node numbers.
-        notices: of each of them, emergency codes by which it only informs.
-        torque_frames: that carry their torques, or their positions.
+        notices: emergency codes by which each of these drives only informs.
+        torque_frames: frames that carry the drives' torques, or their positions.
         heartbeat_host: period of the host's heartbeat [s].
-        heartbeat_drives: period of each drive's [s].
-        heartbeat_timeout: how long the host waits for a drive's [s].
-        heartbeat_wait: how long drives wait for the host's whose watchdog it is [s]; None for as long.
-        watchdogs: of each drive, the signal that it watches (`CanopenDrive.watchdog`).
+        heartbeat_drives: period of each drive's heartbeat [s].
+        heartbeat_timeout: time for which the host waits for a drive's heartbeat [s].
+        heartbeat_wait: time for which drives whose watchdog it is wait for the host's heartbeat [s]; None for
+            `heartbeat_timeout`.
+        watchdogs: signal that each drive watches (`CanopenDrive.watchdog`).
         guarding: guard time [s] and life time factor of drives that are guarded.
-        torque_deadline: after which a drive without torque frames stops by itself [s].
-        status_period: of a drive's status report without a change [s].
+        torque_deadline: time after which a drive without torque frames stops by itself [s].
+        status_period: period of a drive's status report without a change [s].
         status_inhibit: least time between two of them [s].
         position_slots: entries that a drive sends at every SYNC.
         status_slots: entries of its status report; none where the status is sent with the position.

@@ -89,9 +89,9 @@ class Objects:
         """Use the given link, which stays the caller's.
 
         Args:
-            link: of the node's bus.
-            node: its number.
-            others: takes the frames that are not replies of this node.
+            link: link of the node's bus.
+            node: node number.
+            others: called with the frames that are not replies of this node.
         """
         self.node = node
         self._link, self._others = link, others
@@ -187,7 +187,7 @@ class DryRunObjects(Objects):
     """Read the object dictionary of one node, and note what would be written instead of writing it.
 
     Attributes:
-        changes: noted so far, in order; an entry that is written twice is there twice.
+        changes: changes noted so far, in order; an entry that is written twice is there twice.
     """
 
     dry = True
@@ -198,9 +198,9 @@ class DryRunObjects(Objects):
         """Begin without changes.
 
         Args:
-            link: of the node's bus.
-            node: its number.
-            others: takes the frames that are not replies of this node.
+            link: link of the node's bus.
+            node: node number.
+            others: called with the frames that are not replies of this node.
             fixed: keys of the entries that cannot be written, which no upload tells.
         """
         super().__init__(link, node, others)
@@ -244,8 +244,8 @@ class Answers:
     """Hold the answers of nodes to the upload of one entry.
 
     Attributes:
-        values: by node.
-        aborts: codes of those that answered without a value; 0 for an answer that is no value of this type.
+        values: values by node.
+        aborts: abort codes of nodes that answered without a value; 0 for an answer that is no value of this type.
     """
 
     values: dict[Place, int] = field(default_factory=dict)
@@ -281,9 +281,10 @@ def poll(
     Args:
         links: of the arm's buses.
         places: nodes to ask; `BURST` of a bus at a time.
-        entry: to upload.
-        deadline_ns: when nodes that have not answered are given up [ns of the links' clock]; each burst has its share.
-        others: takes the frames that are no answers, with the number of their bus.
+        entry: entry to upload.
+        deadline_ns: time when nodes that have not answered are given up [ns of the links' clock]; each burst has its
+            share.
+        others: called with the frames that are no answers, and the number of their bus.
 
     Raises:
         DriverError: a bus is gone.

@@ -82,8 +82,8 @@ class Zeros:
 
         Args:
             objects: of the drive.
-            number: its.
-            counts: at home.
+            number: number of the drive.
+            counts: counts at home.
             restarted: whether it has sent a boot-up message; asked before, and when its answers have been heard.
 
         Returns:
@@ -132,7 +132,7 @@ class Zeros:
         """Return the counts at home of all drives.
 
         Args:
-            held: counts that each of them confirms.
+            held: counts that each drive confirms.
 
         Raises:
             PositionUnknown: some confirm nothing; the message names them and says what to do.

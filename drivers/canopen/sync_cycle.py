@@ -74,9 +74,9 @@ class Buses:
         clock: of the links.
         complete: whether every drive answered in the last cycle.
         lost: positions that did not come in their cycle, so far.
-        stamp_doubt_ns: of the last cycle, see `Sample`.
-        modes: of operation of each drive; control words come with them.
-        withheld: kinds of watchdogs that are not fed, so that they can be seen to act.
+        stamp_doubt_ns: uncertainty of the last cycle's stamp, see `Sample`.
+        modes: mode of operation of each drive; control words come with it.
+        withheld: kinds of watchdogs that are not fed, so that their reaction can be seen.
         enabled: whether the drives have been energised in this session; from then on those that miss cycles are asked
             for their status word, and stopped by SDO too.
     """
@@ -86,7 +86,7 @@ class Buses:
 
         Args:
             profiles: of the buses.
-            links: to them, in the same order.
+            links: links to the buses, in the same order.
             period_ns: of a cycle [ns].
         """
         self.codecs = [BusCodec(profile) for profile in profiles]
@@ -146,7 +146,7 @@ class Buses:
 
         Args:
             number: of the drive.
-            word: that stops it.
+            word: control word that stops the drive.
             deaf: whether it has not obeyed such a word before.
         """
         self.control(number, word)
@@ -450,13 +450,14 @@ class EnableSequence:
         """Start with drives that are switched off.
 
         Args:
-            drives: of all buses, as their codecs know them.
+            drives: drives of all buses, as their codecs know them.
             names: of the drives, for people.
             step: how long all drives together may take for one step [s].
-            now_ns: of the link's clock.
+            now_ns: present time of the links' clock [ns].
             reports: least and longest time between two status reports of a drive [s].
             quick_stop: 605Ah; drives that stay in quick stop hold the arm, and are enabled out of it with the others.
-            other_modes: has drives asked for their mode; returns what those in another one tell, by number.
+            other_modes: function that asks drives for their mode, and returns the answers of those in another one, by
+                number.
         """
         self._other_modes = other_modes
         self._stays = quick_stop in STAY_IN_QUICK_STOP

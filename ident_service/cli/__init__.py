@@ -257,7 +257,7 @@ def parser(verb: str | None = None) -> Parser:
     """Return the argument parser with all verbs and their arguments.
 
     Args:
-        verb: that will be parsed, for a parser with the verbs of its group alone; all groups where none has it.
+        verb: verb to be parsed, for a parser with the verbs of its group alone; all groups where none has it.
     """
     top = TopParser(
         prog="ident",

@@ -213,7 +213,7 @@ class VerbList:
 
     Attributes:
         commands: argparse's list of verbs.
-        parser: that they are the verbs of.
+        parser: parser that has these verbs.
         prefix: the words before the verb, with a space behind them.
     """
 
@@ -242,7 +242,8 @@ class VerbList:
 
         Args:
             name: the word.
-            run: answers it; None for a noun that another verb must follow.
+            run: function that carries out the verb and returns its answer; None for a noun that another verb must
+                follow.
             text: one short line of help.
             more: further sentences of its own help.
             examples: arguments after the verb; one string each, as typed.
@@ -284,10 +285,10 @@ class VerbList:
         Args:
             name: the noun.
             text: one short line of help.
-            run: answers the bare noun, by a list as a rule; None where a verb must follow.
+            run: function that answers the bare noun, by a list as a rule; None where a verb must follow.
             more: further sentences of its help.
             examples: as for `add`.
-            former: its earlier name.
+            former: earlier name of the noun.
             hidden: leave it out of the list of verbs.
         """
         parser = self.add(name, run, text, more=more, examples=examples, former=former, hidden=hidden)
@@ -388,7 +389,7 @@ def _number(refusal: str, accepts: Callable[[float], bool], read: Callable[[str]
     Args:
         refusal: message about text that is none, or that is not accepted.
         accepts: whether a number is in range; false for what is no number (NaN).
-        read: converts the text; raises ValueError.
+        read: function that converts the text; raises ValueError.
     """
 
     def parse(text: str) -> N:

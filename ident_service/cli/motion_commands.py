@@ -146,13 +146,13 @@ def run_and_report(
     """Move the arm along a motion or to a destination, and return the answer of the verb.
 
     Args:
-        arguments: with `out`, `state` and `can_log`.
+        arguments: arguments of the verb, with `out`, `state` and `can_log`.
         config: of the arm.
-        motion: or destination.
+        motion: motion or destination.
         sentence: description of the motion, printed with the folder before it begins.
         speed: share of the motion's own.
         lease: how long the arm moves on when this process is gone [s]; None for the ordinary one.
-        stop_requested: asked several times per lease.
+        stop_requested: function that is called several times per lease; True stops the motion.
         until: accuracy target at which the run is finished early.
 
     Raises:

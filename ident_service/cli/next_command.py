@@ -30,7 +30,7 @@ class Ended:
     """Verb that has ended.
 
     Attributes:
-        given: its arguments.
+        given: arguments of the verb.
         code: exit code.
         said: the values of its answer.
         run: folder or id of what it made or was about; empty where it was about none.

@@ -37,7 +37,7 @@ class StdinLease:
 
         Args:
             seconds: how long it lasts after a line [s].
-            fd: where lines come.
+            fd: file descriptor that lines are read from.
             now: the lease's clock [s].
         """
         self._seconds, self._fd, self._now = seconds, fd, now
@@ -98,9 +98,9 @@ def requested_lease(
     and the word `stop` do.
 
     Args:
-        arguments: with `lease_from_stdin`.
+        arguments: arguments of the verb, with `lease_from_stdin`.
         config: of the arm.
-        seconds: that it lasts; the ordinary time if None.
+        seconds: length of the lease [s]; the ordinary length when None.
 
     Raises:
         UsageError: standard input is a terminal, at which nobody renews a lease by hand, or closed.

@@ -38,9 +38,9 @@ class Mark:
     """Last thing that is known of the progress of a command.
 
     Attributes:
-        at: when it was told [s].
-        words: what is being done.
-        share: how much of all is done, from 0 to 1; None where that is not known.
+        at: time of the mark [s].
+        words: description of the work in progress.
+        share: share of all work that is done, from 0 to 1; None where that is not known.
         left: time to the end [s] where it is known.
     """
 
@@ -54,9 +54,9 @@ def estimate(begun: float, first: Mark, mark: Mark, now: float) -> tuple[float |
     """Return the share that is done, and the time that is left [s]; None for what cannot be known.
 
     Args:
-        begun: when the command began [s].
+        begun: time when the command began [s].
         first: the first mark with a share; from it on the work is taken to go on as fast as until the last mark.
-        mark: what is known last.
+        mark: the last mark.
         now: the time [s].
     """
     if mark.left is not None:
@@ -108,8 +108,8 @@ class ProgressBar:
         """Tell what is being done; never waits.
 
         Args:
-            words: for a person.
-            share: how much of all is done, from 0 to 1.
+            words: description of the step for a person.
+            share: share of all work that is done, from 0 to 1.
             left: time to the end [s].
         """
         self._mark = mark = Mark(time.monotonic(), words, share, left)

@@ -115,10 +115,10 @@ def job(
 
     Args:
         words: arguments that are fields of the job under their own names.
-        kind: of the job; the verb when None.
+        kind: kind of the job; the verb when None.
         more: further arguments, which `fields` read.
-        ended: turns the job's answer into the verb's; as it is if None.
-        fields: reads the value of a field.
+        ended: function that turns the job's answer into the verb's; the job's own answer when None.
+        fields: reader of each further field's value.
     """
 
     def make(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -167,7 +167,7 @@ def job_verb(make: Callable[[IdentClient, argparse.Namespace], dict[str, Any]], 
 
     Args:
         make: the job of the words; its kind is the verb if it does not say another.
-        ended: turns the job's answer into the verb's; as it is if None.
+        ended: function that turns the job's answer into the verb's; the job's own answer when None.
     """
 
     def verb(client: IdentClient, arguments: argparse.Namespace) -> Answer:
@@ -353,9 +353,10 @@ def follow(
     Args:
         client: of the daemon.
         arguments: of the verb.
-        job: as the daemon answered it.
-        over: asked in each turn; once true, the lease is renewed no more, and the job is cancelled.
-        moves: whether it has a lease.
+        job: the job in the daemon's answer.
+        over: function that is called in each turn; once it returns True, the lease is renewed no more, and the job is
+            cancelled.
+        moves: whether the job has a lease.
         ours: whether this command began the job; another one is left alone, and no longer waited for.
         every: s between turns; the job itself is looked at less often.
 

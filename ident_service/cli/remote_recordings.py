@@ -26,7 +26,7 @@ def recording(
         arguments: of the verb.
         arm: name of the arm that a file is of.
         path: `FILE`, `RUN` or `RUN/NAME`, each with or without `@START:END`.
-        columns: says how a file is laid out.
+        columns: file that describes the columns of a CSV file.
     """
     from ident_service.recordings.files import split_range
 
@@ -48,8 +48,8 @@ def require_registered(client: IdentClient, kind: str, named: str, path: Path) -
     Args:
         client: of the daemon.
         kind: `run` or `motion`.
-        named: its id, if it is one.
-        path: as it was given.
+        named: text that may be its id.
+        path: path as the person gave it.
 
     Raises:
         UnknownId: it is neither.

@@ -135,7 +135,7 @@ def _answered(words: str, values: Callable[[IdentClient, argparse.Namespace], di
 
     Args:
         words: names of the arguments that `values` sends.
-        values: asks the daemon.
+        values: function that asks the daemon for the values.
     """
     return carrying(words, lambda client, arguments: told(arguments, values(client, arguments)))
 
@@ -145,7 +145,7 @@ def _posted(words: str, path: str, also: str = "") -> RemoteVerb:
 
     Args:
         words: names of the arguments.
-        path: after the API's, with names in braces.
+        path: path below that of the API, with names in braces.
         also: further names, of values that the verb itself says.
     """
 

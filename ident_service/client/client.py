@@ -36,14 +36,14 @@ class Job:
     """A job as it stood when it was asked for.
 
     Attributes:
-        id: which names it.
+        id: id of the job.
         kind: `run`, `identify` and so on.
-        arm: its arm's name, if it is about one.
+        arm: name of its arm, if it is about one.
         state: `queued`, `running`, and after its end `done`, `refused`, `failed`, `faulted`, `cancelled` or
             `interrupted`.
         run: id of the run, motion or export that it makes or is about.
-        detail: why it ended so, in words; empty where there is nothing to say.
-        phase: of one that runs.
+        detail: reason for its end, in words; empty where there is nothing to say.
+        phase: phase of a running job.
         held: whether the motion has stopped and its arm, which has no brakes, is held until a person confirms that it
             is supported; until then the job runs.
         document: everything that the daemon tells of it (`JobAnswer` in the OpenAPI description).
@@ -75,10 +75,10 @@ class LiveSample:
     """A moment of a run while it is recorded; the daemon sends one every 20 ms.
 
     Attributes:
-        time: since the first sample [s].
+        time: time since the run's first sample [s].
         joints: names, in the order of the values.
-        position: measured [rad or m]; None for a value that was not valid.
-        torque: commanded [N m or N].
+        position: measured positions [rad or m]; None for a value that was not valid.
+        torque: commanded torques [N m or N].
         following_error: the largest of those 20 ms [rad or m].
     """
 
@@ -95,7 +95,7 @@ class Event:
 
     Attributes:
         kind: `happened` (a line of the audit trail), `job` or `arm` (how one stands), `samples` or `doubt` of a run.
-        number: of what has happened, to go on after it; None for all else.
+        number: number of the event, to continue after it, for kind `happened`; None for all else.
         value: `AuditLine`, `JobAnswer`, or as the OpenAPI description says of the stream.
     """
 
@@ -285,7 +285,7 @@ class IdentClient(Connection):
         Args:
             kind: `simulate`, `design`, `identify`, `export` and so on.
             key: an idempotency key: within a day, the same request with it is the same job.
-            asked: fields of the job.
+            asked: fields of the request.
         """
         body = {"job": {"kind": kind, **{name: value for name, value in asked.items() if value is not None}}}
         return _job(self.post(f"{_API}/jobs", body, {} if key is None else {"Idempotency-Key": key}))
@@ -430,7 +430,7 @@ def left_alone(gone: ArmError, arm: str, job: str) -> ArmError:
     """Return the error of a daemon that is gone, with what the arm does that it moved, and what shows it.
 
     Args:
-        gone: why the daemon cannot be reached.
+        gone: error that tells why the daemon cannot be reached.
         arm: name.
         job: id of its motion.
     """

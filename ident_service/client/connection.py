@@ -43,8 +43,8 @@ class Connection:
 
         Args:
             url: of the daemon: scheme, host and port.
-            token: that authenticates the caller, white space around it left out; None for a stop on the daemon's own
-                machine.
+            token: token that authenticates the caller, white space around it left out; None for a stop on the daemon's
+                own machine.
             patience: how long to wait for an answer [s].
 
         Raises:
@@ -95,10 +95,10 @@ class Connection:
         """Send one request and return its answer as JSON values.
 
         Args:
-            method: of HTTP.
-            path: on the daemon.
+            method: HTTP method.
+            path: path on the daemon, from the root.
             body: JSON values, or bytes that are sent as they are.
-            headers: besides those of the body.
+            headers: headers besides those of the body.
             patience: how long to wait for the answer [s]; as for every other request if None.
 
         Raises:
@@ -227,8 +227,8 @@ def error_of(kind: str, message: str, dependents: Sequence[Mapping[str, Any]] = 
 
     Args:
         kind: name of the error.
-        message: its words.
-        dependents: of `InUse`.
+        message: message of the error.
+        dependents: things that refer to what was to be deleted, for `InUse`.
     """
     if kind == errors.InUse.__name__:
         return errors.InUse(message, [errors.Dependent(**one) for one in dependents])

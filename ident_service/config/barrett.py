@@ -197,7 +197,7 @@ def disagreements(
         transmission: the arm's.
         joints: names of the arm's joints; none where the file does not name them.
         rate: cycles per second.
-        homeless: those without a `home`.
+        homeless: names of joints without a `home`.
     """
     if homeless:
         yield (

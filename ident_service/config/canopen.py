@@ -385,7 +385,8 @@ def motor_speeds(transmission: Transmission, velocities: Sequence[float | None])
 
     Args:
         transmission: the arm's.
-        velocities: of the joints [rad/s or m/s]; None where one has no limit, which counts as standing still.
+        velocities: velocity limits of the joints [rad/s or m/s]; None where one has no limit, which counts as standing
+            still.
     """
     known = np.array([0.0 if one is None else one for one in velocities])
     motors = np.abs(np.array(transmission.ratios)) * (np.abs(transmission.coupling_matrix) @ known)
@@ -414,7 +415,7 @@ def motor_torques(driver: CanopenDriver, transmission: Transmission, torques: Se
     Args:
         driver: the section `driver`, with as many drives as ratios.
         transmission: the arm's.
-        torques: limits of the joints [N m or N]; None where one has none.
+        torques: torque limits of the joints [N m or N]; None where one has none.
     """
     # (motors, joints): tau = J^T tau_motor
     reach = np.abs(np.array(transmission.ratios)[:, None] * transmission.coupling_matrix)
@@ -434,8 +435,8 @@ def quick_stop_decelerations(
     Args:
         driver: the section `driver`.
         transmission: the arm's.
-        accelerations: limits of the joints [rad/s^2 or m/s^2], by which the motors brake in counts per square second
-            where a drive's section does not say otherwise; None where a joint has none.
+        accelerations: acceleration limits of the joints [rad/s^2 or m/s^2], by which the motors brake in counts per
+            square second where a drive's section does not say otherwise; None where a joint has none.
     """
     turns = motor_speeds(transmission, accelerations)
     found: list[int | None] = []
@@ -469,8 +470,9 @@ def disagreements(
         transmission: the arm's.
         joints: names of the arm's joints; none where the file does not name them.
         rate: cycles per second.
-        homeless: those without a `home`.
-        velocities: of the joints [rad/s or m/s], None where one has no limit; none where the file names no joints.
+        homeless: names of joints without a `home`.
+        velocities: velocity limits of the joints [rad/s or m/s], None where one has no limit; none where the file names
+            no joints.
         torques: torque limits of the joints [N m or N], likewise.
     """
     if driver.zero == "at_home" and homeless:

@@ -171,7 +171,7 @@ def family_from(name: str, text: str) -> Family:
 
     Args:
         name: of the file.
-        text: its YAML.
+        text: content of the file, as YAML.
 
     Raises:
         DriverError: it is no family; the message says why.

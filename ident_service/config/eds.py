@@ -42,8 +42,8 @@ class DataSheetEntry:
         mappable: into a PDO.
         low: least value, None where the file says none.
         high: greatest value, likewise.
-        text: its value as the file has it, None where it says none; that of a DCF before the default.
-        configured: whether that is a value which a DCF gives to this drive, not the default of its kind.
+        text: value in the file's own words, None where it says none; that of a DCF before the default.
+        configured: whether the value is one which a DCF gives to this drive, not the default of its kind.
     """
 
     kind: int
@@ -63,7 +63,7 @@ class DataSheetEntry:
         """Return the entry's value as a number, None where it has none.
 
         Args:
-            node: that COB-IDs are relative to.
+            node: node number that COB-IDs are relative to.
         """
         return None if self.text is None else _number(self.text, node)
 
@@ -75,9 +75,9 @@ class DataSheet:
     Attributes:
         entries: by `index << 8 | sub-index`.
         dummies: indices of the dummies that can be mapped (CiA 306-1, `DummyUsage`).
-        identity: what 1018h answers by sub-index, where the file tells it.
-        mistake: why the text is no EDS; None where it may be one.
-        cut_off: why its end seems to be missing, in words; empty where it seems to be whole.
+        identity: values of 1018h by sub-index, where the file has them.
+        mistake: reason why the text is no EDS; None where it may be one.
+        cut_off: reason why its end seems to be missing, in words; empty where the file seems to be whole.
     """
 
     entries: Mapping[int, DataSheetEntry] = field(default_factory=dict)

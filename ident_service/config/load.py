@@ -421,7 +421,7 @@ def _where(loc: tuple[int | str, ...], value: Any, keys: dict[int, list[str]]) -
     Args:
         loc: the location.
         value: the whole file.
-        keys: of the tables that were met, listed once each, since every value of a large table may be wrong.
+        keys: keys of the tables met so far, listed once each, since every value of a large table may be wrong.
     """
     where: list[str | int] = []
     for number, part in enumerate(loc):

@@ -26,8 +26,8 @@ class MotorLimits:
 
     Attributes:
         to_motors: J^-T, torque of the motors [N m] per torque of the joints [N m or N], shape (motors, joints).
-        torque: of each motor [N m], infinite where nothing is known, shape (motors,).
-        together: which motors move each joint, directly or through other joints, shape (joints, motors).
+        torque: torque limit of each motor [N m], infinite where nothing is known, shape (motors,).
+        together: mask of the motors that move each joint, directly or through other joints, shape (joints, motors).
     """
 
     to_motors: Vector
@@ -71,8 +71,8 @@ class MotionLimits:
         following_error: largest distance from the reference.
         kp: position gains [1/s^2] (table 4).
         kd: velocity gains [1/s] (table 4).
-        home: where motions begin and end.
-        motors: of motors that share joints; None where each joint has its own, whose limit is the joint's.
+        home: position where motions begin and end.
+        motors: limits of motors that share joints; None where each joint has its own motor, whose limit is the joint's.
     """
 
     lower: Vector

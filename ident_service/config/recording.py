@@ -110,7 +110,7 @@ class Column(Section):
         """Return the factor that converts a number of this column to SI.
 
         Args:
-            name: ours, such as `tau3`, which says the quantity.
+            name: column name of this package, such as `tau3`, which says the quantity.
 
         Raises:
             ValueError: an unknown unit, one of another quantity, one that needs a factor, or a factor that repeats
@@ -228,7 +228,7 @@ def motor_disagreements(
 
     Args:
         what: the motors' name, and their key in the section `driver`.
-        motors: how many there are.
+        motors: number of motors.
         lost_cycles: `driver.lost_cycles`.
         transmission: the arm's.
         joints: names of the arm's joints; none where the file does not name them.
@@ -338,7 +338,7 @@ def mismatched_units(form: RecordingFormat, joints: Sequence[str], revolute: Seq
     Args:
         form: the section `recording`.
         joints: names of the arm's joints.
-        revolute: for each, whether it turns.
+        revolute: mask of the revolute joints.
     """
     positions, torques = form.motor_sides
     for name, one in form.columns.items():

@@ -55,9 +55,9 @@ class FaultRule:
     """Rule for the description of one kind of fault.
 
     Attributes:
-        does: what it does, in words.
-        size: what its size is, with the unit; None where it has none.
-        of_joint: whether it may be one joint's.
+        does: effect of the fault, in words.
+        size: meaning of its size, with the unit; None where it has none.
+        of_joint: whether the fault may be one joint's.
         stays: whether it stays when no duration is given, instead of striking for one cycle.
     """
 

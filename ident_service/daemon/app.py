@@ -77,8 +77,8 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
     """Create the service as an ASGI application; its database is opened now, its queue runs during its lifespan.
 
     Args:
-        settings: how it runs.
-        connections: of the listener that it is served by; None where something else counts them.
+        settings: settings of the service.
+        connections: connections of the listener that serves the application; None where something else counts them.
 
     Raises:
         UsageError: the state folder cannot be used.

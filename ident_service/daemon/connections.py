@@ -73,7 +73,7 @@ class Connections:
         """Begin without connections.
 
         Args:
-            most: how many there may be; half as many of one address.
+            most: largest number of connections; half as many of one address.
             now: clock of the deadlines [s].
         """
         self._most, self._most_of_one, self._now = most, max(most // 2, 1), now
@@ -220,8 +220,8 @@ class Listener(socket.socket):
         """Create the listening socket; it is not bound yet.
 
         Args:
-            family: of addresses.
-            book: counts.
+            family: address family, such as `socket.AF_INET`.
+            book: counter of the connections.
         """
         super().__init__(family, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
         self._book, self._accepted, self._gone = book, 0, 0

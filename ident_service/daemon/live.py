@@ -57,10 +57,10 @@ class Thinned:
 
     Attributes:
         joints: names of the joints.
-        time: of the last sample in each bin [s] after the recording's first, shape (bins,).
-        position: measured, of that sample [rad or m], shape (bins, joints).
+        time: time of the last sample in each bin [s] after the recording's first, shape (bins,).
+        position: measured position of that sample [rad or m], shape (bins, joints).
         reference: position that was asked for, likewise.
-        torque: commanded, likewise [N m or N].
+        torque: commanded torque of that sample [N m or N], shape (bins, joints).
         error: following error of largest size in the bin [rad or m], shape (bins, joints).
         measured: torque that the drives measured [N m or N], shape (bins, joints); None where they measured none.
     """

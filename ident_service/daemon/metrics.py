@@ -81,9 +81,9 @@ class Metrics:
 
         Args:
             kind: of the job.
-            state: that it ended in.
-            waited: before it began or was cancelled [s].
-            ran: from then on [s]; None for one that never began.
+            state: final state of the job.
+            waited: time before it began or was cancelled [s].
+            ran: time from its beginning to its end [s]; None for one that never began.
         """
         self._wait.labels(kind).observe(waited)
         if ran is not None:

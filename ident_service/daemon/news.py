@@ -38,7 +38,7 @@ class ViewerEvent:
     Attributes:
         kind: `happened`, `arm` or `job`.
         data: JSON.
-        number: of a `happened` event; None for a state.
+        number: number of a `happened` event; None for a state.
     """
 
     kind: str
@@ -52,7 +52,7 @@ class ViewerPosition:
 
     Attributes:
         line: number of the last line of the audit trail.
-        version: of how things stand.
+        version: version of the present states of arms and jobs.
     """
 
     line: int

@@ -321,8 +321,8 @@ class Pager:
         """Return the lines of one page, and name the next page in the header.
 
         Args:
-            most: lines of a page.
-            read: returns so many lines.
+            most: largest number of lines on a page.
+            read: function that returns so many lines.
             key: column of the lines that `before` takes.
         """
         found = read(most + 1)

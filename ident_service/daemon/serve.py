@@ -175,7 +175,7 @@ def serve(settings: Settings, tell: Callable[[str], None] = lambda _: None) -> N
     """Serve the API until a signal ends the process.
 
     Args:
-        settings: how.
+        settings: settings of the service.
         tell: called with the address, when it answers.
 
     Raises:

@@ -21,7 +21,7 @@ class Settings:
     Attributes:
         state: the state folder.
         host: address to listen on; one that is not a loopback one needs a certificate and its key.
-        port: to listen on; 0 for any that is free.
+        port: port to listen on; 0 for any that is free.
         tls_cert: file of the certificate chain, PEM.
         tls_key: file of its key, PEM.
         names: host names under which clients may reach it, besides the address.
@@ -29,7 +29,7 @@ class Settings:
         webhook: address that notices go to; None for nobody.
         webhook_secret: file of the secret that they are signed with.
         computing: how many jobs compute at a time.
-        lease_factor: for tests on machines that stall (`jobs/queue.py`).
+        lease_factor: factor of the leases, for tests on machines that stall (`jobs/queue.py`).
     """
 
     state: Path

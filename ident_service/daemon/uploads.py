@@ -109,12 +109,12 @@ class Announced:
     """Recording that is to be uploaded, as announced.
 
     Attributes:
-        arm: whose it is.
+        arm: name of the arm.
         name: of the file.
-        bytes: its size.
-        sha256: of its content.
+        bytes: size of the file [bytes].
+        sha256: hash of the file's content.
         columns: YAML that says how it is laid out; empty where the arm's description does.
-        by: who announced it.
+        by: name of the person or token that announced it.
     """
 
     arm: str
@@ -135,7 +135,7 @@ class Upload:
     """State of an upload.
 
     Attributes:
-        id: which names it.
+        id: id of the upload.
         announced: the recording as announced.
         received: bytes that are there; the next piece begins at this offset.
         run: id of the run that it became; None before it is whole.
@@ -222,7 +222,7 @@ def require_readable(path: Path, announced: Announced, config: ArmConfig) -> Non
 
     Args:
         path: of the file.
-        announced: it, as announced.
+        announced: announcement of the recording.
         config: of its arm.
 
     Raises:
@@ -272,7 +272,7 @@ class Piece:
         Args:
             state: the state folder.
             upload: id.
-            offset: of the piece's first byte in the recording.
+            offset: offset of the piece's first byte in the recording.
 
         Raises:
             UnknownId: no such upload.
@@ -334,7 +334,7 @@ def complete_upload(db: Database, state: Path, upload: str, who: str) -> Upload:
         db: the registry.
         state: the state folder.
         upload: id.
-        who: completes it.
+        who: name of the requester.
 
     Raises:
         UnknownId: no such upload, or its arm is gone.

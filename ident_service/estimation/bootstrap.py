@@ -40,13 +40,14 @@ class Bootstrap:
 
     Attributes:
         betas: the estimate of each replicate in SI units, shape (replicates, base).
-        mean: over replicates, shape (base,).
-        covariance: over replicates, shape (base, base); infinite on the diagonal where a replicate's data are blind.
-        standard_deviations: its diagonal's square root, shape (base,).
+        mean: mean of the replicates, shape (base,).
+        covariance: covariance of the replicates, shape (base, base); infinite on the diagonal where a replicate's data
+            are blind.
+        standard_deviations: square roots of the covariance's diagonal, shape (base,).
         intervals: lower and upper percentile, shape (base, 2); infinite where blind.
         level: share of the replicates inside each interval.
-        run: blocks in a run.
-        blocks: blocks there were to draw from.
+        run: number of consecutive blocks drawn together.
+        blocks: number of blocks drawn from.
         seed: of the draws.
     """
 
@@ -82,14 +83,14 @@ def bootstrap(
     """Repeat the estimate for recordings resampled from blocks drawn with replacement.
 
     Args:
-        equations: what `fit` was fitted to, in blocks of time.
-        fit: its weights per joint count for every replicate.
+        equations: equations that `fit` solves, in blocks of time.
+        fit: least squares whose weights per joint every replicate uses.
         base: grouping of the parameters.
         conditions: the feasible set.
         replicates: number of resampled recordings; at least 2.
         seed: of the draws; the same seed gives the same replicates.
-        solve: from a replicate's least squares to base parameters of shape (base,); the constrained least squares
-            (eq. 74) over `conditions` when None.
+        solve: function from a replicate's least squares to base parameters of shape (base,); the constrained least
+            squares (eq. 74) over `conditions` when None.
         run: consecutive blocks drawn together; `run_length` says how many when None.
         level: share of the replicates inside the intervals, between 0 and 1.
         progress: called after each replicate with how many are done, and how many there will be.
@@ -149,11 +150,11 @@ def constrained_intervals(
 
     Args:
         fit: unconstrained least squares.
-        covariance: of it, shape (base, base); infinite on the diagonal for what is not seen.
+        covariance: covariance of `fit.beta`, shape (base, base); infinite on the diagonal for what is not seen.
         beta: the constrained estimate, shape (base,).
         base: grouping of the parameters.
         conditions: the feasible set.
-        prior: that the estimate was drawn to.
+        prior: prior that the estimate is drawn to; None for none.
 
     Returns:
         Lower and upper end, shape (base, 2); infinite for what is not seen.
@@ -208,7 +209,7 @@ def run_length(equations: Equations, fit: LeastSquares) -> int:
     from the autocorrelation of what each block adds to the estimate, pooled over the parameters.
 
     Args:
-        equations: what `fit` was fitted to.
+        equations: equations that `fit` solves.
         fit: the estimate.
     """
     count = len(equations.blocks)

@@ -69,7 +69,7 @@ class Statement:
         names: link parameters.
         K: per base parameter the coefficients of its expression.
         beta: base parameters.
-        blocks: what must be positive.
+        blocks: matrices or lists of numbers that must be positive.
         equalities: lists of numbers that must be zero.
     """
 
@@ -120,7 +120,7 @@ def prove(
     """Round the multipliers, make the equations hold exactly, and check the rest exactly.
 
     Args:
-        statement: what they are multipliers of.
+        statement: statement that the multipliers prove.
         multipliers: per block, strictly inside the cone on the rows that are not zero, shape (entries,) each.
         y: multipliers of the statement's rows, shape (rows,).
 
@@ -190,8 +190,8 @@ def repair(
     Args:
         equations: coefficients by unknown.
         right: right-hand sides.
-        values: what is nearly a solution.
-        weight: the larger, the sooner an unknown is changed.
+        values: approximate solution.
+        weight: weight of an unknown; one with a larger weight is changed sooner.
 
     Returns:
         The values that solve the equations, or None where these contradict each other.
@@ -478,10 +478,10 @@ class Certificate:
     """Proof of feasibility or infeasibility, or the statement that there is none.
 
     Attributes:
-        verdict: what is proven.
-        document: what `parameters.json` holds as `feasibility.certificate`; all numbers are texts.
-        shares: of an infeasible verdict, the conditions that contradict the base parameters with their share of the
-            contradiction, the largest first, shares summing to 1.
+        verdict: proven verdict.
+        document: content of `parameters.json` under `feasibility.certificate`; all numbers are texts.
+        shares: for an infeasible verdict, the conditions that contradict the base parameters, each with its share of
+            the contradiction, the largest first; the shares sum to 1.
         margin: the numerical margin of the BPFT, or None where it was not needed or its solver failed.
     """
 
@@ -503,7 +503,7 @@ def certify(
 
     Args:
         beta: base parameters in SI units as they are printed, shape (base,).
-        base: their grouping.
+        base: grouping of the link parameters.
         conditions: the feasible set over the same link parameters.
         delta: link parameters with `K delta = beta`, tried as witness first, shape (parameters,).
         expressions: the expressions as they are printed, where these are not `base.expressions` letter by letter.
@@ -546,12 +546,12 @@ def certificate_arm(
 
     Args:
         name: of the arm.
-        sha256: of its description; None where no file names it.
+        sha256: hash of the arm's description; None where no file names it.
         base: grouping of its link parameters.
-        conditions: from its description, of either set.
+        conditions: conditions of the arm's description, of either set.
         units: of its link parameters, shape (parameters,).
-        joints: their names in the order of the links.
-        expressions: as they are printed, where these are not `base.expressions` letter by letter.
+        joints: names of the joints in the order of the links.
+        expressions: base parameters as they are printed, where they are not `base.expressions` letter by letter.
 
     Raises:
         ParameterError: an expression does not parse.

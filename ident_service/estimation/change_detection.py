@@ -74,7 +74,8 @@ class Motion:
         responses: per joint a matrix whose product with a difference of parameters has as its length the root mean
             square of the change of torque [N m or N], shape (rows, base).
         torque: root mean square of each joint's measured torque [N m or N], shape (joints,).
-        residual: and of what the identified parameters leave unexplained of it, shape (joints,).
+        residual: root mean square of the torque that the identified parameters leave unexplained [N m or N], shape
+            (joints,).
     """
 
     responses: tuple[Array, ...]
@@ -88,7 +89,7 @@ class Motion:
         Args:
             information: the equations.
             beta: all base parameters that were identified from them, SI units, shape (base,).
-            places: which of them the responses are about, in their order; all when None.
+            places: indices of the base parameters that the responses are about, in that order; all when None.
         """
         wanted = np.arange(information.base) if places is None else np.array(places, dtype=np.intp)
         rows = np.sqrt(np.maximum(information.rows, 1))
@@ -111,10 +112,10 @@ class ComparedEstimate:
 
     Attributes:
         leading: the link parameter that each base parameter is named after, `fv2` for example.
-        values: unconstrained where known, SI units, shape (base,).
-        covariance: of them, infinite on the diagonal where nothing was seen, shape (base, base).
-        blocks: stretches of time that the covariance comes from; None where it is known exactly.
-        motion: of the recordings that were fitted to; None where it was not kept.
+        values: values of the base parameters, unconstrained where known, SI units, shape (base,).
+        covariance: covariance of the values, infinite on the diagonal where nothing was seen, shape (base, base).
+        blocks: number of time blocks that the covariance was estimated from; None where it is known exactly.
+        motion: torque response of the fitted recordings; None where it was not kept.
     """
 
     leading: tuple[str, ...]
@@ -137,10 +138,10 @@ class Test:
 
     Attributes:
         statistic: T^2, the squared length of the difference in deviations.
-        directions: r, how many independent directions it has.
+        directions: r, number of independent directions of the difference.
         degrees: nu of the covariances; infinite where they are known.
-        p: how often a larger statistic comes about when nothing has changed.
-        left_out: directions in which nothing could be tested.
+        p: probability of a larger statistic by chance when nothing has changed.
+        left_out: number of directions in which nothing could be tested.
     """
 
     statistic: float
@@ -163,11 +164,12 @@ class Effect:
         kind: of effect.
         number: of the joint or link, from 1.
         places: indices of its parameters.
-        test: that they have not changed.
-        p: of the test, after Holm.
-        joint: the one whose torque changes most for its size, from 0; None where no motion is known.
-        torque_share: of that joint's torque, by which its prediction changes (root mean squares); None likewise.
-        residual_share: of that joint's residual; None likewise.
+        test: test of the hypothesis that these parameters have not changed.
+        p: p-value of the test, after Holm's correction.
+        joint: index of the joint whose torque changes most for its size, from 0; None where no motion is known.
+        torque_share: change of that joint's predicted torque, as a share of its torque (root mean squares); None where
+            no motion is known.
+        residual_share: the same change as a share of that joint's residual; None where no motion is known.
         changed: whether it is significant, and large enough to matter where that can be said.
     """
 
@@ -188,15 +190,16 @@ class ParameterChange:
 
     Attributes:
         difference: second less first, shape (base,).
-        deviations: its standard deviations, infinite where either saw nothing, shape (base,).
+        deviations: standard deviations of the difference, infinite where either estimate saw nothing, shape (base,).
         z: difference in deviations, 0 where nothing was seen, shape (base,).
-        p: of each parameter alone, after Holm over the parameters, shape (base,).
+        p: p-value of each parameter's own test, after Holm's correction over the parameters, shape (base,).
         joint: the test of all parameters together.
-        joint_p: of that test, after Holm over it and the effects.
-        torque_share: per joint, of its torque, by which the prediction changes, shape (joints,); None without a motion.
-        residual_share: per joint, of its residual, likewise.
+        joint_p: p-value of the joint test, after Holm's correction over it and the effects.
+        torque_share: change of each joint's predicted torque, as a share of its torque, shape (joints,); None without a
+            motion.
+        residual_share: the same change as a share of each joint's residual, shape (joints,); None without a motion.
         effects: all of them, in the order of the parameters.
-        verdict: in one word.
+        verdict: verdict in one word.
     """
 
     difference: Array
@@ -320,7 +323,7 @@ def difference_test(first: ComparedEstimate, second: ComparedEstimate, places: S
     Args:
         first: one set.
         second: the other.
-        places: which parameters, from 0.
+        places: indices of the tested parameters, from 0.
     """
     chosen = np.array(places, dtype=np.intp)
     seen = chosen[[np.isfinite(first.covariance[k, k] + second.covariance[k, k]) for k in places]]
@@ -388,10 +391,10 @@ class Cause:
     """One possible cause of a difference.
 
     Attributes:
-        kind: what has changed.
+        kind: kind of thing that has changed.
         number: of the joint or link, from 1.
         explained: share of the change of torque, squared and in units of residuals, from 0 to 1.
-        changes: of the link parameters, those that the difference shows, in SI units.
+        changes: changes of the link parameters that the difference shows, by name, in SI units.
     """
 
     kind: CauseKind
@@ -404,10 +407,10 @@ def causes(difference: Array, K: Array, names: Sequence[str], motion: Motion) ->
     """Return every possible single cause of a difference, the best explanation first.
 
     Args:
-        difference: of base parameters, SI units, shape (base,).
-        K: of eq. 38, shape (base, link parameters).
+        difference: difference of base parameters, SI units, shape (base,).
+        K: matrix K of eq. 38, shape (base, link parameters).
         names: of the link parameters.
-        motion: on which torques are compared.
+        motion: motion whose torques are compared.
     """
     units = np.maximum(motion.residual, np.finfo(float).tiny)
     R = np.vstack([response / unit for response, unit in zip(motion.responses, units, strict=True)])
@@ -438,7 +441,7 @@ def meaning_of_cause(cause: Cause, links: int) -> str:
 
     Args:
         cause: to explain.
-        links: of the arm; the last one carries tools.
+        links: number of links of the arm; the last one carries tools.
     """
     if cause.kind == "body":
         return _MEANINGS["last" if cause.number == links else "body"]
@@ -458,7 +461,7 @@ def friction_ratio(first: ComparedEstimate, second: ComparedEstimate, joint: int
     Args:
         first: the reference.
         second: the later one; the speed is that of its motion.
-        joint: from 1.
+        joint: index of the joint, from 1.
 
     Returns:
         The ratio, and the speed [rad/s or m/s]; None where no motion is known, or the first has no such friction.

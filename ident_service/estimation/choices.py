@@ -35,7 +35,7 @@ class Choice:
 
     Attributes:
         option: key in the configuration's section `identification`.
-        value: that was chosen.
+        value: chosen value.
         held_out: relative torque error [percent] on held-out parts, per alternative.
     """
 
@@ -95,7 +95,7 @@ def held_out_thirds(
         parts: equations of consecutive stretches of time.
         weights: per joint, what its equations are multiplied by, shape (joints,).
         base: grouping of the parameters.
-        conditions: that estimates are held in.
+        conditions: feasible set that constrains the estimates.
 
     Returns:
         Relative torque errors [percent], the joints weighed by `weights`, shape (parts,); infinite where nothing can

@@ -35,9 +35,9 @@ class CustomFunction:
 
     Attributes:
         name: `module:function`.
-        file: that the module was read from, without its folder.
+        file: name of the file that the module was read from, without its folder.
         sha256: of the file.
-        function: from link and base parameters by name to constraints.
+        function: function from link and base parameters, by name, to constraints.
     """
 
     name: str

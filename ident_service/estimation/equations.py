@@ -48,10 +48,10 @@ class Rows:
         time: [s] since the recording's first sample, shape (samples,).
         H_b: base regressor, shape (joints, base, samples).
         torque: [N m or N], shape (samples, joints).
-        keep: which of them are of joints in motion, not near standstill, shape (samples, joints).
+        keep: mask of the rows of joints in motion, not near standstill, shape (samples, joints).
         position: smoothed [rad or m], shape (samples, joints).
         velocity: smoothed [rad/s or m/s], shape (samples, joints).
-        moving: where all drives of a joint are faster than `reversal.speed`, shape (samples, joints).
+        moving: mask of the rows where all drives of a joint are faster than `reversal.speed`, shape (samples, joints).
     """
 
     time: Array
@@ -81,9 +81,10 @@ class Equations:
 
     Attributes:
         blocks: information of consecutive stretches of time, rows near standstill apart.
-        samples: smoothed samples that went in.
-        near: of the same stretches, the rows near standstill; none where they are among the blocks.
-        labels: of the blocks; those with the same label show the same motion. None shows another's where empty.
+        samples: number of smoothed samples used.
+        near: information of the rows near standstill, in the same stretches; none where they are among the blocks.
+        labels: labels of the blocks; blocks with the same label show the same motion. Where empty, no block shows
+            another's motion.
     """
 
     blocks: tuple[Information, ...]
@@ -149,10 +150,10 @@ def equations(
 
     Args:
         recordings: to read, one or several.
-        model: its configuration says how to smooth.
+        model: model whose configuration says how to smooth.
         base: grouping of the parameters.
-        row_weights: what each row is multiplied by, shape (samples, joints); with it, those near standstill are
-            among the blocks.
+        row_weights: function that returns the factors of the rows, shape (samples, joints); with it, rows near
+            standstill are among the blocks.
         judging: whether only errors are computed from them, for which no joint has to move.
 
     Raises:
@@ -178,11 +179,11 @@ def equations_of(
 
     Args:
         recordings: to read.
-        model: its configuration says how to cut them into blocks.
+        model: model whose configuration says how to cut the recordings into blocks.
         felt: per joint, which columns it feels, increasing.
-        rows_of: gives a recording's rows in consecutive chunks.
-        row_weights: what each row is multiplied by, as of `equations`.
-        judging: as of `equations`.
+        rows_of: function that yields a recording's rows in consecutive chunks.
+        row_weights: function that returns the factors of the rows, as for `equations`.
+        judging: as for `equations`.
 
     Raises:
         RecordingError: a recording does not fit the arm, or some joint moves in none of them.
@@ -200,7 +201,7 @@ def require_motion(recordings: Sequence[Recording], model: ArmModel, moved: NDAr
     """Raise unless every joint moves in some recording.
 
     Args:
-        recordings: that were read.
+        recordings: recordings that `moved` is of.
         model: the arm.
         moved: whether each joint was faster than `identification.reversal.speed` somewhere, shape (joints,).
 
@@ -366,7 +367,7 @@ def known_torque(recording: Recording, model: ArmModel, base: BaseParameters, ro
     """Return the torque of a recording's known payload [N m or N], shape (samples, joints); None without one.
 
     Args:
-        recording: that the rows are of.
+        recording: recording of the rows.
         model: the arm.
         base: grouping of its parameters.
         rows: of the recording.

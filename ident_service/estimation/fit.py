@@ -53,11 +53,11 @@ class Prepared:
 
     Attributes:
         model: the arm, with the friction's shape and the delay as numbers.
-        equations: of all recordings, torques multiplied by `torque_scales`.
+        equations: equations of all recordings, torques multiplied by `torque_scales`.
         delay: between position and torque, where it was estimated.
-        torque_scales: what each joint's measured torque was multiplied by, shape (joints,).
-        choices: of what the configuration left to be chosen.
-        shapes: which numbers of the friction's shape were fitted.
+        torque_scales: factor of each joint's measured torque, shape (joints,).
+        choices: choices among what the configuration left open.
+        shapes: names of the fitted numbers of the friction's shape.
         torque_constants: of the motors, where they were identified; `model` multiplies recorded torques by them.
     """
 
@@ -76,17 +76,18 @@ class Fit:
 
     Attributes:
         fit: the least squares whose factors constrained estimates use.
-        equations: what it solves, with row weights where the method has them.
+        equations: equations that `fit` solves, with row weights where the method has them.
         weighed: the same without row weights, rows near standstill multiplied by `shares`.
-        covariance: from blocks of scores, with the doubt about fitted shapes of friction, shape (base, base).
+        covariance: covariance from blocks of scores, with the uncertainty of fitted friction shapes, shape (base,
+            base).
         deviations: standard deviations on the careful side, shape (base,), see `uncertainty.py`.
         degrees: degrees of freedom of the deviations, shape (base,).
-        noise: variances by what differs between repetitions of the motion, shape (base,); None where most is not
+        noise: variances from the differences between repetitions of the motion, shape (base,); None where most is not
             repeated.
-        shares: what rows near standstill are multiplied by, shape (joints,).
+        shares: factors of the rows near standstill, shape (joints,).
         method: estimator.
-        remarks: what a person should know of how it was found, in words.
-        choices: between estimators, where there was one.
+        remarks: remarks on how the estimate was found, for people.
+        choices: choice of the estimator, where there was one.
     """
 
     fit: LeastSquares
@@ -114,11 +115,11 @@ def prepare(
     """Find delay, friction shape and torque constants, which make the equations linear, and gather the equations.
 
     Args:
-        recordings: to fit to.
+        recordings: recordings to fit to.
         model: the arm.
         base: grouping of the parameters.
-        conditions: that torque constants are found under, and choices judged.
-        validation: what will be judged on; only whether it has velocities is looked at.
+        conditions: feasible set of the estimates that torque constants and choices are judged by.
+        validation: recordings to validate on; only whether they have velocities is looked at.
         torque_constants: whether to identify those of the motors, with any parameters or with feasible ones.
 
     Raises:
@@ -188,7 +189,7 @@ def _with_velocity(
 
     usual = with_chosen_cutoff(of("position"), recordings)
     there = all(
-        not one.torque_held and all(block.velocity is not None for block in one.blocks())
+        not one.torque_zero_order_hold and all(block.velocity is not None for block in one.blocks())
         for one in (*recordings, *validation)
     )
     if not there or options.period is not None:
@@ -318,10 +319,10 @@ def allowed_change(fit: LeastSquares, base: BaseParameters, deviations: Array, b
     larger than the one that is told; so no torque changes by what could be seen. Friction does not move.
 
     Args:
-        fit: unconstrained.
+        fit: unconstrained least squares.
         base: grouping of the parameters.
-        deviations: that are told, shape (base,).
-        beta: what they move from, shape (base,).
+        deviations: reported standard deviations, shape (base,).
+        beta: base parameters before the change, shape (base,).
 
     Returns:
         None where no parameter was seen, or nothing is uncertain.

@@ -62,8 +62,8 @@ class _Travel:
     """Distances that one drive travels: between its reversals, and of each kept sample since the last reversal.
 
     Attributes:
-        signs: of the motion that each reversal begins, the first one included.
-        distances: travelled until the next reversal [rad or m].
+        signs: directions of the motion after each reversal, 1 or -1, the first one included.
+        distances: distances travelled until the next reversal [rad or m].
         segments: per kept sample, the reversal before it.
         since: per kept sample, the distance travelled since then [rad or m].
         fresh: reversals that begin a stretch, where nothing is known of the motion before.
@@ -208,7 +208,7 @@ class FrictionTrials:
         Args:
             presliding: x0 per drive [rad or m], shape (drives,).
             stribeck_velocity: v_s per drive [rad/s or m/s], shape (drives,).
-            parts: of the samples, one result each, such as `thirds`; all together when None.
+            parts: ranges of samples, each with a result of its own, such as `thirds`; all together when None.
         """
         wanted = [slice(0, self._rows)] if parts is None else list(parts)
         found: list[list[Array]] = [[] for _ in wanted]
@@ -482,10 +482,10 @@ def fit_friction(
     """Fit every number that the configuration leaves to be fitted.
 
     Args:
-        trials: of the recordings that are fitted to; None is for where nothing is to be fitted.
+        trials: rows of the fitted recordings; None where nothing is to be fitted.
         model: the arm; `identification.friction` says what to fit.
         base: grouping of its parameters, which these numbers do not change.
-        conditions: that choices are judged under; nothing is chosen when None.
+        conditions: feasible set of the estimates that judge choices; nothing is chosen when None.
 
     Returns:
         The arm with its numbers, and for each kind whether it was fitted or left out.
@@ -516,9 +516,9 @@ def at_search_bounds(shape: FrictionShape, joints: Sequence[str], terms: Sequenc
     """Describe the fitted numbers that lie at an end of the search: the true value may lie beyond, or not exist.
 
     Args:
-        shape: fitted.
-        joints: their names.
-        terms: of the model's joints; without Stribeck friction its velocity means nothing.
+        shape: fitted shape of the friction.
+        joints: names of the joints.
+        terms: terms of the model's joints; without Stribeck friction its velocity means nothing.
     """
     found = []
     for key, what in (("presliding", "pre-sliding distance"), ("stribeck_velocity", "Stribeck velocity")):

@@ -71,12 +71,12 @@ class Candidate:
     """One of the paper's estimates, with its torque errors.
 
     Attributes:
-        name: for tables.
+        name: name for tables.
         beta: base parameters, shape (base,).
-        margin: of the feasibility test under the arm's conditions; its sign is the verdict.
+        margin: margin of the feasibility test under the arm's conditions; its sign is the verdict.
         identification: error on all rows of the recordings it was fitted to.
         moving: error on the rows that were fitted to, those near a velocity reversal left out.
-        validation: errors on recordings that it never saw.
+        validation: errors on the validation recordings.
     """
 
     name: str
@@ -92,8 +92,8 @@ class CustomKnowledge:
     """Function of `constraints.custom`, and the torque errors with and without it.
 
     Attributes:
-        function: that was called.
-        solver: that found the constrained estimates.
+        function: the called function.
+        solver: name of the solver that found the constrained estimates.
         error: relative torque error [percent] (eq. 84) of the estimate, on the rows that were fitted to.
         error_without: the same of the estimate that knows the rest of the description alone.
     """
@@ -116,16 +116,16 @@ class Estimate:
         constrained: whether it was forced into that set.
         beta: base parameters in SI units, shape (base,).
         delta: link parameters with K delta = beta inside the set, shape (parameters,); None where none exist.
-        margin: of delta inside the set, or of the feasibility test when infeasible.
+        margin: margin of delta inside the set, or of the feasibility test when infeasible.
         tight: blocks of the set that the estimate presses against or violates.
         covariance: of the unconstrained estimate, see `Fit`, shape (base, base).
-        standard_deviations: on the careful side, shape (base,): at least its diagonal's square root, see
-            `uncertainty.py`.
-        white_standard_deviations: the paper's (eq. 81), shape (base,).
+        standard_deviations: standard deviations on the careful side, at least the square roots of the covariance's
+            diagonal, see `uncertainty.py`, shape (base,).
+        white_standard_deviations: standard deviations of the paper (eq. 81), shape (base,).
         degrees: degrees of freedom of the standard deviations, shape (base,).
         negligible: sizes below which parameters are as good as zero on this motion, shape (base,).
-        noise_deviations: by what differs between repetitions of the motion alone, shape (base,); None where it is not
-            repeated.
+        noise_deviations: standard deviations from the differences between repetitions of the motion alone, shape
+            (base,); None where it is not repeated.
         constrained_intervals: 95 % intervals of the constrained estimate, shape (base, 2); None where no condition
             bends it, or further knowledge does.
         verdicts: one per base parameter.
@@ -134,14 +134,14 @@ class Estimate:
         prepared: the equations, and what had to be found before them: friction's shape, delay, torque constants.
         fitted: the equations that the fit solves, for what else is to be asked of them (bootstrap, essential ones).
         information: the rows, in motion and near standstill, without a robust method's weights; what is kept of them.
-        prior: what the constrained estimates were drawn to, where they were.
-        nearest_to: which bodies the link values were chosen near to; None where they were not chosen.
+        prior: prior that the constrained estimates were drawn to; None for none.
+        nearest_to: bodies that the link values were chosen near to; None where they were not chosen.
         recordings: name and hash of what it was fitted to.
         candidates: the estimates of table 8, this one's among them.
         chosen: index of this estimate among the candidates.
-        standstill_shares: what rows near standstill were multiplied by in the fit, shape (joints,).
-        choices: what the configuration left to be chosen, and by how much it was better.
-        remarks: what a person should know of how it was found, in words.
+        standstill_shares: factors of the rows near standstill in the fit, shape (joints,).
+        choices: choices among what the configuration left open, with the errors of the alternatives.
+        remarks: remarks on how the estimate was found, for people.
         custom: further knowledge in the estimate, where the description names some and it is constrained; neither
             `margin` nor a certificate is about it.
         second: another solution of the constrained problem, where it was asked for.
@@ -209,7 +209,7 @@ def identify(
         method: estimator, the configuration's when None.
         set_name: feasible set to hold the estimate in, `none` for none; the configuration's when None.
         custom: the function that the configuration's `constraints.custom` names, loaded by `load_custom`.
-        solver: of the problems that are posed in cvxpy, those with `custom` and the second opinion.
+        solver: name of the solver for the problems posed in cvxpy: those with `custom`, and the second opinion.
         again: whether to solve the constrained problem a second time.
         step: called with what is being done and the share of the time that is over, from 0 to 1, as a rule.
         torque_constants: whether to identify those of the motors with the parameters; needs a known payload.

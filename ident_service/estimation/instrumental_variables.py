@@ -59,11 +59,11 @@ class InstrumentalEstimate:
 
     Attributes:
         beta: base parameters in SI units, not constrained, shape (base,).
-        covariance: from leaving out one block at a time, shape (base, base).
-        standard_deviations: its diagonal's square root, shape (base,).
+        covariance: covariance from leaving out one block at a time, shape (base, base).
+        standard_deviations: square roots of the covariance's diagonal, shape (base,).
         feasible_beta: the nearest feasible ones in the metric of the equations, shape (base,).
         delta: feasible link parameters that belong to them, shape (parameters,).
-        rounds: how often the motion was simulated.
+        rounds: number of times that the motion was simulated.
         change: largest change of a parameter in this round, in its standard deviations; of the rounds that there are,
             the one that changed least. Above `SETTLED` it has not settled.
         strength: correlation of each instrument with its regressor column, shape (base,); below about 0.9 much of
@@ -95,7 +95,7 @@ def instrumental_variables(
     """Refine an estimate by instrumental variables from simulated motions.
 
     Args:
-        recordings: what `fit` was fitted to.
+        recordings: recordings that `fit` was fitted to.
         model: the arm.
         base: grouping of the parameters.
         conditions: the feasible set, which every simulated arm is in.
@@ -239,7 +239,8 @@ class SimulatedRecording:
             stretches: stamps [ns], and positions [rad or m] of shape (samples, joints); whatever lies outside stays.
         """
         self.path, self.sha256, self.joint_names = measured.path, measured.sha256, measured.joint_names
-        self.joints, self.torque_held, self.torn = measured.joints, measured.torque_held, measured.torn
+        self.joints, self.torn = measured.joints, measured.torn
+        self.torque_zero_order_hold = measured.torque_zero_order_hold
         self._measured, self._stretches = measured, tuple(stretches)
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
@@ -259,10 +260,10 @@ def simulated(recording: Recording, model: ArmModel, delta: Array, cutoff: float
     """Return the recording as the arm would have made it without noise.
 
     Args:
-        recording: whose positions the simulated arm follows, and whose stamps and torques are kept.
+        recording: recording whose positions the simulated arm follows, and whose stamps and torques are kept.
         model: the arm; its configuration says what to trim.
-        delta: its parameters, shape (parameters,).
-        cutoff: of the low-pass on the positions that it follows [Hz].
+        delta: link parameters of the arm, shape (parameters,).
+        cutoff: cut-off of the low-pass on the positions [Hz].
 
     Raises:
         ModelError: a link has no positive mass, the loop runs away, or a cut-off above half the rate.

@@ -259,8 +259,8 @@ def ridge(products: Array, right: Array) -> Array:
     """Solve normal equations by ridge regression: columns may be alike, unseen ones get zero.
 
     Args:
-        products: of the columns, shape (columns, columns).
-        right: their products with what is to be explained, shape (columns,) or (columns, cases).
+        products: products of the columns with each other, shape (columns, columns).
+        right: products of the columns with the right-hand sides, shape (columns,) or (columns, cases).
     """
     sizes = np.diag(products)
     seen = sizes > _LEAST_COLUMN**2 * sizes.max(initial=0.0)

@@ -65,10 +65,10 @@ class Reading:
     Attributes:
         which: columns that it is about.
         joints: one whose sign is negated, two that are exchanged, or all.
-        all_negated: whether it is about all, with the other sign.
-        factor: that the columns of one joint, or of all, are multiplied by; torques are divided where both are read.
+        all_negated: whether all columns are meant, with the other sign.
+        factor: factor of the columns of one joint, or of all; torques are divided where both are read.
         late: time by which the torque of one joint is stamped too late [s].
-        zero: that is added to the position of one joint [rad].
+        zero: angle added to the position of one joint [rad].
     """
 
     which: _Which
@@ -115,7 +115,7 @@ class MisreadColumns:
     """A reading that explains the recordings far better.
 
     Attributes:
-        reading: that does.
+        reading: the reading.
         before: torque error in motion with the columns as they are.
         after: the same with that reading.
     """
@@ -195,8 +195,9 @@ def misread_columns(estimate: Estimate, recordings: Sequence[Recording]) -> Misr
     recordings at most a minute is fitted.
 
     Args:
-        estimate: what was identified.
-        recordings: that it was fitted to; without them only signs of torques are tried, on the estimate's equations.
+        estimate: identified estimate.
+        recordings: recordings that the estimate was fitted to; without them only signs of torques are tried, on the
+            estimate's equations.
     """
     moving = estimate.candidates[estimate.chosen].moving
     own = moving.joint_relative_percent
@@ -349,7 +350,7 @@ class _Equations:
         torques: the same combinations of all joints' torques, shape (rows, joints); then of these at each delay.
         rows: equations that went into each joint's, shape (joints,).
         base: number of base parameters.
-        delays: by which torques may be late [s], shape (delays,).
+        delays: delays of the torques [s], shape (delays,).
     """
 
     supports: tuple[NDArray[np.intp], ...]
@@ -376,7 +377,7 @@ class _Equations:
         """Return the torque errors that least squares without conditions leaves [percent], shape (readings, joints).
 
         Args:
-            readings: of the torques.
+            readings: readings of the torques.
             weights: per joint, what its equations are multiplied by, shape (joints,).
         """
         H, torques = [], []

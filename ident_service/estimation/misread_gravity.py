@@ -43,7 +43,7 @@ class MisreadGravity:
     """Another gravity that explains the recordings far better.
 
     Attributes:
-        gravity: that does, in the base frame [m/s^2], shape (3,); zero where the torques lack it.
+        gravity: the other gravity in the base frame [m/s^2], shape (3,); zero where the torques lack it.
         before: torque error in motion with the gravity that is described.
         after: the same with that gravity.
     """
@@ -88,8 +88,8 @@ def misread_gravity(estimate: Estimate, recordings: Sequence[Recording]) -> Misr
     recordings at most a minute is fitted.
 
     Args:
-        estimate: what was identified.
-        recordings: that it was fitted to.
+        estimate: identified estimate.
+        recordings: recordings that the estimate was fitted to.
     """
     own = estimate.candidates[estimate.chosen].moving
     worst = own.joint_relative_percent.max(initial=0.0)

@@ -37,10 +37,10 @@ class Elimination:
     """Removal of one base parameter, with the F-test that judged it.
 
     Attributes:
-        parameter: which base parameter, counted from 0.
-        deviations: its size over its standard deviation when its turn came.
-        F: what the model without it and all before it loses, in units of chance.
-        critical: what chance alone exceeds at the level of the test.
+        parameter: index of the base parameter, from 0.
+        deviations: size of the parameter over its standard deviation at its removal.
+        F: F statistic of the model without this parameter and those removed before.
+        critical: critical value of F at the level of the test.
     """
 
     parameter: int
@@ -56,13 +56,14 @@ class Essential:
     Attributes:
         kept: base parameters that stay, increasing.
         beta: all base parameters in SI units, fitted again, 0 where removed, shape (base,).
-        standard_deviations: from blocks, given that what was removed is 0, 0 there, shape (base,).
-        eliminated: what left, in this order.
+        standard_deviations: standard deviations from blocks, given that removed parameters are 0; 0 for these, shape
+            (base,).
+        eliminated: removed parameters, in the order of their removal.
         refused: the elimination that the test refused; None where nothing is left to remove.
         effective_samples: N above.
         level: of the test.
         full: torque error of the whole model on the equations it was fitted to.
-        reduced: of this one.
+        reduced: torque error of the reduced model on the same equations.
     """
 
     kept: NDArray[np.intp]
@@ -87,10 +88,11 @@ def essential_parameters(
     """Remove the base parameters that the data do not need, one by one, until an F-test refuses.
 
     Args:
-        equations: what `fit` was fitted to.
+        equations: equations that `fit` solves.
         fit: ordinary or weighted least squares of all base parameters; its weights stay.
-        level: how often chance alone may call a model worse that is not, between 0 and 1.
-        covariance: of `fit`, from blocks, shape (base, base); computed when None.
+        level: level of the test: probability, between 0 and 1, that chance alone makes it call a model worse that is
+            not.
+        covariance: covariance of `fit` from blocks, shape (base, base); computed when None.
 
     Raises:
         ModelError: directions that the data do not see, which no refit can decide about; or a level outside (0, 1).
@@ -147,8 +149,8 @@ def effective_samples(fit: LeastSquares, covariance: Array, rows: int) -> float:
 
     Args:
         fit: the estimate, with its white standard deviations (eq. 81).
-        covariance: of the estimate, from blocks, shape (base, base).
-        rows: that it was fitted to.
+        covariance: covariance of the estimate from blocks, shape (base, base).
+        rows: number of rows that the estimate was fitted to.
     """
     white, blocks = fit.standard_deviations**2, np.diag(covariance)
     seen = np.isfinite(white) & np.isfinite(blocks) & (blocks > 0.0)

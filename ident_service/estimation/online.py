@@ -39,13 +39,13 @@ class ParameterUncertainty:
     """Parameter uncertainty after the samples processed so far.
 
     Attributes:
-        seconds: of motion that went in [s].
+        seconds: length of the motion processed [s].
         beta: least squares, each joint's equations divided by its residual [SI], shape (base,).
-        deviations: by eq. 81, or by the blocks where those are kept and say more [SI], shape (base,); infinite where
-            nothing is known yet.
+        deviations: standard deviations by eq. 81, or by the blocks where those are kept and say more [SI], shape
+            (base,); infinite where nothing is known yet.
         negligible: sizes below which parameters are as good as zero on the motion so far [SI], shape (base,).
         verdicts: a word per base parameter.
-        blocks: how many were kept, repetitions of the same motion counted once.
+        blocks: number of blocks that were kept, repetitions of the same motion counted once.
         until_ns: stamp of the last sample that went in.
     """
 
@@ -175,7 +175,7 @@ class SequentialLeastSquares:
 class _Window:
     """Samples that implement the recording protocol; torques are held from stamp to stamp."""
 
-    torque_held, torn, sha256 = True, False, ""
+    torque_zero_order_hold, torn, sha256 = True, False, ""
     path = Path("the run so far")
 
     def __init__(self, block: Block, names: tuple[str, ...]) -> None:

@@ -75,11 +75,11 @@ class KnownArm:
     """Arm that has been identified: model, base parameters and covariance.
 
     Attributes:
-        model: with its friction's shape and delay as numbers.
+        model: model of the arm, with its friction's shape and delay as numbers.
         base: grouping of its parameters.
         beta: base parameters in SI units, shape (base,).
-        covariance: of them, infinite on the diagonal where nothing was seen, shape (base, base).
-        blocks: that the covariance comes from; None where it is known exactly.
+        covariance: covariance of `beta`, infinite on the diagonal where nothing was seen, shape (base, base).
+        blocks: number of time blocks that the covariance was estimated from; None where it is known exactly.
         residual: root mean square of what was left unexplained at each joint where it was identified [N m or N], over
             all rows, shape (joints,); None where unknown.
     """
@@ -104,10 +104,10 @@ class Body:
     """Body nearest to an estimate among those that were added, or among those that were taken off.
 
     Attributes:
-        delta: its ten parameters in the last link's frame (eq. 13), positive mass, and the offsets, shape (names,);
-            those that no motion shows are as a ball of this mass has them.
-        b: what it adds to the arm in base parameters of the payload: minus itself if taken off, shape (payload,).
-        p: how often an estimate lies farther away by chance.
+        delta: ten parameters of the body in the last link's frame (eq. 13), positive mass, and the offsets, shape
+            (names,); those that no motion shows are as a ball of this mass has them.
+        b: change of the arm by the body, in base parameters of the payload: negative if taken off, shape (payload,).
+        p: probability that an estimate lies farther away by chance.
         torque_share: per joint, of its torque, by which it predicts otherwise than the estimate, shape (joints,).
         explains: whether it lies near enough, in deviations or in torque.
         margin: smallest eigenvalue of its pseudo-inertia.
@@ -127,18 +127,18 @@ class Payload:
 
     Attributes:
         base: grouping of the ten parameters in the last link's frame, and of the offsets if they were refitted.
-        T: what these add to the arm's base parameters, shape (base of the arm, payload).
+        T: matrix from base parameters of the payload to those of the arm, shape (base of the arm, payload).
         fit: the unconstrained least squares; `fit.beta` is b.
-        noise: its covariance from this recording alone, shape (payload, payload).
-        G: what b depends on the arm's beta by, with the sign turned, shape (payload, base of the arm).
-        covariance: of b, the arm's uncertainty included, infinite on the diagonal where nothing was seen.
-        standard_deviations: its diagonal's root, shape (payload,).
+        noise: covariance of b from this recording alone, shape (payload, payload).
+        G: negative derivative of b with respect to the arm's beta, shape (payload, base of the arm).
+        covariance: covariance of b, the arm's uncertainty included, infinite on the diagonal where nothing was seen.
+        standard_deviations: square roots of the covariance's diagonal, shape (payload,).
         verdicts: one per base parameter of the payload.
-        blocks: of time, that `noise` comes from.
-        test: that there is no payload.
+        blocks: number of time blocks that `noise` was estimated from.
+        test: test of the hypothesis that there is no payload.
         torque_share: per joint, what the payload changes of its torque (root mean squares), shape (joints,).
-        verdict: in one word.
-        body: that was added or taken off; None otherwise.
+        verdict: verdict in one word.
+        body: body that was added or taken off; None for the other verdicts.
         without: torque error of the arm as it was identified, on this recording.
         fitted: torque error with the body, or with the unconstrained estimate where no body explains it.
         excess: per joint, the residual of `fitted` over that of the identification; None where that is not known.
@@ -174,7 +174,7 @@ def identify_payload(arm: KnownArm, recorded: Equations, *, refit_offsets: bool 
     """Identify the payload of an arm from a recording with it.
 
     Args:
-        arm: as it was identified, with another load or none.
+        arm: the arm as it was identified, with another load or none.
         recorded: equations of the second recording in the arm's base parameters, from `fit.gather`.
         refit_offsets: whether the offset of every joint may differ too, as after a restart that zeroed the torques.
 

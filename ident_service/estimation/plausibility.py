@@ -57,8 +57,8 @@ class Objections:
     """Reasons why an estimate must not be used.
 
     Attributes:
-        wrong: what is wrong with recordings or description.
-        little_motion: that the motion tells too little, which a longer or richer one mends.
+        wrong: faults of the recordings or the description, in words.
+        little_motion: reasons why the motion tells too little, which a longer or richer one mends.
     """
 
     wrong: tuple[str, ...]
@@ -82,8 +82,8 @@ def reasons_against(estimate: Estimate, recordings: Sequence[Recording] = ()) ->
 
     Args:
         estimate: to judge.
-        recordings: that it was fitted to, to find columns that were misread; without them only wrong signs of torques
-            are found.
+        recordings: recordings that the estimate was fitted to, to find columns that were misread; without them only
+            wrong signs of torques are found.
     """
     names = estimate.model.chain.names
     misread, gravity = misread_columns(estimate, recordings), misread_gravity(estimate, recordings)
@@ -107,7 +107,7 @@ def reasons_in_length(estimate: Estimate, seconds: float) -> tuple[str, ...]:
 
     Args:
         estimate: to judge.
-        seconds: that the recordings it was fitted to last.
+        seconds: total length of the fitted recordings [s].
     """
     rows = estimate.prepared.equations.moving.rows
     moved = seconds * float(rows.max(initial=0)) / max(estimate.samples, 1)
@@ -133,8 +133,8 @@ def reasons_in_recording(recording: str, joints: Sequence[JointQuality], model: 
     """Return the reasons why a recording cannot be of this arm in SI units; empty where there are none.
 
     Args:
-        recording: its name, for the words.
-        joints: what was seen of its joints.
+        recording: name of the recording, for the words.
+        joints: quality of each joint's samples.
         model: the arm and its limits.
     """
     found = [
@@ -163,7 +163,7 @@ def torque_clipped(estimate: Estimate, recordings: Sequence[Sequence[JointQualit
 
     Args:
         estimate: to judge.
-        recordings: what was seen of the joints of each that it was fitted to.
+        recordings: quality of each joint's samples, per fitted recording.
     """
     errors = estimate.candidates[estimate.chosen].moving.joint_relative_percent
     found = []
@@ -183,8 +183,8 @@ def remarks_on_limits(recording: str, joints: Sequence[JointQuality], model: Arm
     """Return remarks on joints that leave their position limits by less than what makes a recording unusable.
 
     Args:
-        recording: its name, for the words.
-        joints: what was seen of its joints.
+        recording: name of the recording, for the words.
+        joints: quality of each joint's samples.
         model: the arm and its limits.
     """
     found = []

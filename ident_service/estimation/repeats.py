@@ -36,10 +36,11 @@ class Stretches:
     """Division of a recording into stretches of time, labelled by the motion they show.
 
     Attributes:
-        length: of each [s].
-        origin: where one of them begins [s since the recording's first sample]; its first equation's when None.
-        labels: of the stretches from number `first` on; stretches with the same label show the same motion.
-        first: number of the stretch that the first label is of.
+        length: length of each stretch [s].
+        origin: beginning of one of the stretches [s since the recording's first sample]; its first equation's when
+            None.
+        labels: labels of the stretches from number `first` on; stretches with the same label show the same motion.
+        first: number of the stretch that the first label belongs to.
         recording: index of the recording, for stretches without a label.
     """
 
@@ -105,7 +106,8 @@ def stretches(
 
     Args:
         recordings: of one arm.
-        lengths: of the stretches of each [s]; what repeats is cut into whole parts of about the same length.
+        lengths: length of the stretches of each recording [s]; what repeats is cut into whole parts of about the same
+            length.
         fmt: what to trim, what a gap is, and the rate; the defaults when None.
         phases: least number of stretches in a period.
 

@@ -62,8 +62,8 @@ def huber(
         model: the arm.
         base: grouping of the parameters.
         start: an estimate to begin from.
-        torque_scales: what each joint's measured torque is multiplied by, shape (joints,); ones when None.
-        shares: what rows near standstill are multiplied by, shape (joints,); ones when None.
+        torque_scales: factor of each joint's measured torque, shape (joints,); ones when None.
+        shares: factors of the rows near standstill, shape (joints,); ones when None.
         spread: `spread_rows` of these, where they have been read already.
 
     Raises:

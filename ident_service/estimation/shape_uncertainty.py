@@ -38,7 +38,7 @@ class ShapeUncertainty:
     """Uncertainty of base parameters by the doubt about the friction's shape, or about torque constants.
 
     Attributes:
-        covariance: to be added to theirs, shape (base, base), SI units.
+        covariance: covariance to be added to that of the base parameters, SI units, shape (base, base).
         degrees: degrees of freedom of its variances, shape (base,); infinite where a bound of the search is all that is
             known.
         known_degrees: degrees of freedom of the variances that take the shape for known, the fitted numbers counted
@@ -57,8 +57,8 @@ class ShapeUncertainty:
         Satterthwaite's (1946), or as many as before.
 
         Args:
-            deviations: that take the shape for known, widened, shape (base,); may be infinite.
-            degrees: of freedom, shape (base,).
+            deviations: standard deviations that take the shape for known, widened, shape (base,); may be infinite.
+            degrees: degrees of freedom of the deviations, shape (base,).
         """
         own, added = np.minimum(degrees, self.known_degrees), np.minimum(degrees, self.degrees)
         variances = (deviations / widening(degrees)) ** 2, np.diag(self.covariance)
@@ -83,14 +83,14 @@ def shape_uncertainty(
     """Return what the doubt about the friction's shape adds to the uncertainty of base parameters.
 
     Args:
-        recordings: that both were fitted to.
+        recordings: recordings that shape and base parameters were fitted to.
         model: the arm, the shape of its friction as numbers.
         base: grouping of its parameters.
-        fitted: which of the numbers were fitted, as `fitted_friction_parameters` names them.
+        fitted: names of the fitted numbers, as of `fitted_friction_parameters`.
         beta: base parameters, shape (base,).
         weights: per joint, what its equations are multiplied by, shape (joints,).
-        torque_scales: what each joint's measured torque is multiplied by, shape (joints,).
-        shares: what rows near standstill are multiplied by, shape (joints,).
+        torque_scales: factor of each joint's measured torque, shape (joints,).
+        shares: factors of the rows near standstill, shape (joints,).
 
     Raises:
         RecordingError: a recording cannot be used.

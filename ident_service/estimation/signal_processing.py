@@ -144,10 +144,10 @@ class _Smooth:
         time: [s] since the recording's first sample, shape (samples,).
         position, velocity, acceleration: [rad or m and derivatives], shape (samples, joints).
         torque: [N m or N], shape (samples, joints).
-        start: of the samples that count, none of which is in another window.
-        stop: of them.
+        start: index of the first sample that counts; no sample counts in two windows.
+        stop: index after the last sample that counts.
         opens: whether a stretch without gaps begins with it.
-        closes: whether one ends with it.
+        closes: whether a stretch without gaps ends with it.
     """
 
     time: Array
@@ -196,7 +196,7 @@ class _Smoother:
 
     Attributes:
         margin: samples on either side of a window that its ends reach.
-        key: what its results depend on beside the recording.
+        key: key of everything beside the recording that the results depend on.
     """
 
     def __init__(self, recording: Recording, options: Identification, period: float) -> None:
@@ -208,7 +208,7 @@ class _Smoother:
                 f"sampled at {1.0 / period:.4g} Hz, too slow for a cut-off of {self._cutoff:g} Hz; "
                 "lower identification.smoothing.cutoff",
             )
-        self._smoothing, self._period, self._held = smoothing, period, recording.torque_held
+        self._smoothing, self._period, self._held = smoothing, period, recording.torque_zero_order_hold
         self._path = recording.path
         self._delay = 0.0 if isinstance(options.delay, str) else float(options.delay)
         slowest = 2.0 * np.pi * self._cutoff * np.sin(np.pi / (2 * smoothing.order))
@@ -324,7 +324,7 @@ class Averaged:
 
     Attributes:
         motion: one period.
-        periods: how many were averaged.
+        periods: number of periods that were averaged.
         torque_noise: standard deviation of one torque sample between periods [N m or N], shape (joints,).
     """
 
@@ -343,7 +343,7 @@ def averaged(
     """Average a recording over its periods, in memory for one period.
 
     Args:
-        recording: of a periodic motion; whatever is not (approach, return) trimmed by `fmt`.
+        recording: recording of a periodic motion; whatever is not periodic (approach, return) is trimmed by `fmt`.
         options: cut-off and rows near reversal.
         period: of the motion [s].
         coupling: drive coordinates per joint coordinates; the identity when None.
@@ -391,7 +391,7 @@ def averaged(
             f"joint {joint + 1} differs by {spread_q[joint]:.3g} between periods of {period:g} s; "
             "trim approach and return with recording.trim, or correct identification.period",
         )
-    motion = _motion(mean_q, mean_tau, recording.torque_held, options, step, coupling)
+    motion = _motion(mean_q, mean_tau, recording.torque_zero_order_hold, options, step, coupling)
     return Averaged(motion, total, spread_tau)
 
 

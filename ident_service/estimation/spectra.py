@@ -97,7 +97,7 @@ def remarks_on_noise(recordings: Sequence[Recording], model: ArmModel) -> tuple[
     """Say of which recordings the filter passes noise of the positions that biases least squares.
 
     Args:
-        recordings: that are fitted to.
+        recordings: fitted recordings.
         model: the arm, with numbers for its filter.
 
     Raises:

@@ -65,15 +65,14 @@ class TorqueConstants:
     Attributes:
         factors: kappa, what the recorded torque of each motor is multiplied by, shape (motors,); 1 where the recordings
             do not show it.
-        deviations: their standard deviations on the careful side, shape (motors,); infinite where not shown.
+        deviations: standard deviations of the factors on the careful side, shape (motors,); infinite where not shown.
         verdicts: of each motor's factor.
         covariance: of the factors that are shown, zero for the others, shape (motors, motors).
         degrees: degrees of freedom of the deviations, shape (motors,).
         follow: d beta / d kappa, shape (base, motors).
-        error_percent: what the motors' torques differ by from those that are explained, as a share of them (eq. 84)
-            [percent].
+        error_percent: relative difference of the motors' torques from the explained ones (eq. 84) [percent].
         error_before: the same with all factors at 1 [percent].
-        applied: factors that recorded torques were multiplied by before, shape (motors,), by the description.
+        applied: factors that the description had already applied to recorded torques, shape (motors,).
     """
 
     factors: Array
@@ -105,7 +104,7 @@ def identify_torque_constants(
     """Identify the torque constants of an arm's motors jointly with its base parameters.
 
     Args:
-        recordings: with the payloads that they carry (`CachedRecording.payload`), one at least.
+        recordings: recordings with the payloads that they carry (`CachedRecording.payload`), one at least.
         model: the arm, the shape of its friction and the delay as numbers.
         base: grouping of its parameters.
         conditions: the set that parameters must lie in; None for none.
@@ -191,7 +190,7 @@ class _Point:
     Attributes:
         beta: base parameters, shape (base,).
         gains: g, shape (motors,).
-        free: which gains are sought, shape (motors,).
+        free: mask of the gains that are sought, shape (motors,).
     """
 
     beta: Array

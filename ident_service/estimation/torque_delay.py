@@ -42,7 +42,7 @@ class Delay:
 
     Attributes:
         seconds: the estimate [s]; negative where the torque is stamped early.
-        deviation: its white standard deviation [s].
+        deviation: white standard deviation of the delay [s].
     """
 
     seconds: float
@@ -95,10 +95,11 @@ def choose_delay(
     It is searched for within a few samples, and further on about the largest of them while that one is clearly better.
 
     Args:
-        trials_at: gives rows of the recordings that are fitted to, the torque taken to be stamped so much too late [s].
+        trials_at: function that returns rows of the fitted recordings, for a torque that is stamped too late by its
+            argument [s].
         period: of their samples [s].
         base: grouping of the parameters.
-        conditions: that estimates are held in.
+        conditions: feasible set that constrains the estimates.
 
     Returns:
         The delay [s], and how it was chosen; None where a joint does not move in every third. Zero where it would be

@@ -56,10 +56,10 @@ class Uncertainty:
         deviations: standard deviations on the careful side, shape (base,), SI units: the largest of several lengths of
             the blocks, widened for its degrees of freedom.
         degrees: degrees of freedom of those deviations before they were widened, shape (base,).
-        noise: variances [SI^2] by what differs between repetitions of the motion, shape (base,); None where most of the
-            motion is not repeated, so that noise and error of the model cannot be told apart.
-        inflation: by how much variances are larger than those of eq. 81, the mean over all directions of the largest
-            of several lengths of the blocks; at least 1. One number, which few blocks do not spoil.
+        noise: variances [SI^2] from the differences between repetitions of the motion, shape (base,); None where most
+            of the motion is not repeated, so that noise and error of the model cannot be told apart.
+        inflation: ratio of the variances to those of eq. 81, the mean over all directions of the largest of several
+            lengths of the blocks; at least 1. One number, which few blocks do not spoil.
     """
 
     covariance: Array
@@ -74,8 +74,8 @@ def uncertainty(equations: Equations, fit: LeastSquares) -> Uncertainty:
     """Estimate covariance, standard deviations and degrees of freedom from blocks.
 
     Args:
-        equations: in blocks.
-        fit: what solves them.
+        equations: equations in blocks.
+        fit: least squares that solves the equations.
     """
     clusters = equations.clusters
     seen = [_Whitened.of(cluster, fit) for cluster in clusters]
@@ -107,9 +107,9 @@ def inflated_covariance(equations: Equations, fit: LeastSquares, doubt: Uncertai
     from the blocks alone; its size is of all directions together. For tests that find the size of each themselves.
 
     Args:
-        equations: in blocks.
-        fit: what solves them.
-        doubt: of that.
+        equations: equations in blocks.
+        fit: least squares that solves the equations.
+        doubt: uncertainty of that fit.
     """
     covariance = fit.inverse @ fit.inverse.T * (_white_variance(equations, fit) * doubt.inflation)
     unseen = ~np.isfinite(doubt.deviations)
@@ -147,8 +147,8 @@ def jackknife(
     """Estimate a covariance by leaving out one cluster after the other (HC3).
 
     Args:
-        clusters: blocks that count as one.
-        fit: what solves all of them.
+        clusters: clusters of blocks; each cluster counts as one piece of evidence.
+        fit: least squares that solves all of them.
         along: combinations of the parameters, shape (base, combinations); each parameter alone when None. The
             covariance of few blocks says nothing about combinations, as it knows most of them far too well: their
             degrees of freedom must be asked for with them.
@@ -167,7 +167,8 @@ class _Whitened:
 
     Attributes:
         score: shape (base,).
-        share: of the information, symmetric with eigenvalues from 0 to 1, the cluster's leverages; shape (base, base).
+        share: share of the cluster in the information, symmetric, with its leverages as eigenvalues, from 0 to 1; shape
+            (base, base).
     """
 
     score: Array
@@ -255,7 +256,7 @@ def widening(degrees: Array) -> Array:
     """Return the factors of standard deviations that make 1.96 of them the 95 % of Student's t, shape (base,).
 
     Args:
-        degrees: of freedom, shape (base,).
+        degrees: degrees of freedom, shape (base,).
     """
     from scipy.special import stdtrit  # loads for 0.2 s, and a run without a target judges nothing
 
@@ -302,7 +303,7 @@ def verdicts(beta: Array, deviations: Array, as_zero: Array) -> tuple[Verdict, .
 
     Args:
         beta: parameters, shape (base,).
-        deviations: of them, shape (base,).
+        deviations: standard deviations of the parameters, shape (base,).
         as_zero: sizes below which parameters are as good as zero, shape (base,), see `negligible`.
     """
     return tuple(

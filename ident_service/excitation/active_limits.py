@@ -42,10 +42,10 @@ class ActiveLimit:
     """Active limit of a motion, with its multiplier.
 
     Attributes:
-        limit: its name among those of `Problem`.
-        joint: its place, None for what is no joint's.
+        limit: name of the limit among those of `Problem`.
+        joint: index of the joint; None for a limit that is no joint's.
         exponent: lambda; the motion gains by the factor `r^lambda` where the limit is r times as wide.
-        by_gain: likewise where the joint's position gain is r times as stiff.
+        by_gain: the same exponent for a position gain of the joint that is r times as stiff.
     """
 
     limit: str
@@ -58,8 +58,8 @@ def binding(task: Task, coefficients: Array, per_period: int) -> tuple[ActiveLim
     """Return the limits that constrain a motion, the costliest first.
 
     Args:
-        task: what was searched.
-        coefficients: of the motion, shape (joints, size).
+        task: task of the search.
+        coefficients: coefficients of the motion, shape (joints, size).
         per_period: samples per period.
     """
     problem = Problem(task, per_period)
@@ -100,8 +100,8 @@ def needed_stiffness(task: Task, coefficients: Array, per_period: int) -> Array:
     """Return how many times as stiff each joint has to be to follow at its velocity limit, shape (joints,).
 
     Args:
-        task: what was searched.
-        coefficients: of a motion, through whose postures the arm has to go, shape (joints, size).
+        task: task of the search.
+        coefficients: coefficients of a motion whose postures the arm has to reach, shape (joints, size).
         per_period: samples per period.
     """
     problem = Problem(task, per_period)
@@ -120,11 +120,11 @@ def active_limit_lines(
 
     Args:
         found: the limits.
-        task: what was searched.
-        limits: of the arm, margins included.
+        task: task of the search.
+        limits: limits of the arm, margins included.
         velocity: largest velocity of the motion [rad/s or m/s], shape (joints,).
         lengths: unit of each joint's position.
-        gains: by joint, what `stiffer_gains` proposes.
+        gains: proposals of `stiffer_gains`, by joint.
     """
     names, lines = task.model.chain.names, []
     left = dict(gains or {})
@@ -164,9 +164,9 @@ def stiffer_gains(
     Args:
         found: the limits.
         late: joints that a simulated arm moves too far off their references, shape (joints,).
-        needed: times the stiffness, `needed_stiffness`.
-        limits: for the gains that there are.
-        stable: judges gains kp and kd, each of shape (joints,).
+        needed: needed stiffness over the present one, from `needed_stiffness`, shape (joints,).
+        limits: limits of the arm, with its present gains.
+        stable: function that judges gains kp and kd, each of shape (joints,).
     """
     pays = 1.0 * late
     for one in found:

@@ -54,10 +54,10 @@ def safe_posture(model: ArmModel, limits: MotionLimits, seed: int = 0, extra_cle
     """Return the posture nearest to home that leaves the motion room, shape (joints,).
 
     Args:
-        model: its prior gives the gravity torque.
-        limits: what a motion may use, margins taken off.
+        model: model whose prior gives the gravity torque.
+        limits: limits of the motion, margins taken off.
         seed: of the postures that are tried.
-        extra_clearance: kept free beyond the workspace's clearance [m].
+        extra_clearance: distance kept free beyond the workspace's clearance [m].
 
     Raises:
         MotionRefused: no posture keeps the limits; the message says which of them stand in the way.
@@ -134,11 +134,11 @@ class Attempt:
     Attributes:
         task: of the search that found it.
         candidate: the motion at full size.
-        proof: of it at full size.
-        why: what speaks against that, in words; empty where nothing does.
+        proof: proof of the motion at full size.
+        why: objection to the motion at full size, in words; empty for none.
         result: coefficients and proof of the largest motion that could be proven, None where none could.
-        value: the criterion of that; infinite where there is none.
-        refused: what speaks against the last size that was tried.
+        value: criterion of the largest proven motion; infinite where there is none.
+        refused: objection to the last size that was tried, in words.
     """
 
     task: Task
@@ -171,8 +171,9 @@ class Prover:
             safe: a posture that keeps all limits, shape (joints,).
             torque_margin: share of the torque that motions keep free.
             value: the criterion of a motion's coefficients, to be made small.
-            veto: what else speaks against a motion of which everything is proven, in words.
-            clock: of the search's budget [s].
+            veto: function that returns a further objection to a motion of which everything is proven, in words; None
+                for none.
+            clock: clock of the search's budget [s].
         """
         self._model, self._task, self._safe, self._margin = model, task, safe, torque_margin
         self._value, self._veto, self._clock = value, veto, clock
@@ -197,12 +198,13 @@ class Prover:
         """Return the best motion that can be proven, of candidates and an earlier attempt.
 
         Args:
-            candidates: of the search, whose own values are smooth ones, by which another candidate may be the best.
+            candidates: candidates of the search. Their values are of a smoothed criterion, by which another one may be
+                the best.
             per_period: samples per period of the search, to go on with.
-            seconds: for searching on, proofs not counted; no bound when None.
-            cancelled: asked at every evaluation; True ends searching on.
+            seconds: time for searching on, proofs not counted [s]; no bound when None.
+            cancelled: called at every evaluation; True ends searching on.
             best: an earlier attempt.
-            task: of the search that found them; that of all proofs when None.
+            task: task of the search that found the candidates; the task of all proofs when None.
         """
         task = task or self._task
         ranked = sorted((self._value(one.coefficients), place) for place, one in enumerate(candidates))
@@ -306,8 +308,8 @@ class Designed:
     Attributes:
         excitation: the motion, ready to be written.
         proof: bounds that hold at every instant.
-        condition_number: of the stacked regressor over one pass, as in the paper.
-        found: of the search, to go on from.
+        condition_number: condition number of the stacked regressor over one pass, as in the paper.
+        found: result of the search, to go on from.
         binding: what holds the motion back, and what it costs, in words.
     """
 
@@ -437,16 +439,17 @@ def design_motion(
         model: of the arm, with prior parameters.
         design: criterion, margins and, unless `basis` is given, the family of motions.
         seed: of the random starts.
-        budget: of the search; a minute on two cores when None.
+        budget: budget of the search; a minute on two cores when None.
         basis: another family of motions.
         base: the parameters that the motion shall teach; all that the family can when None.
         noise: standard deviation of each joint's torque, shape (joints,); from the description when None.
         added: information from earlier recordings (`settled`).
-        earlier: of a search for the same task, to go on from.
-        veto: what else speaks against a motion of which everything is proven, in words; such a motion is made smaller.
-        stable: judges gains kp and kd, each of shape (joints,), before they are proposed.
+        earlier: earlier search for the same task, to go on from.
+        veto: function that returns a further objection to a motion of which everything is proven, in words, or None; a
+            motion with one is made smaller.
+        stable: function that judges gains kp and kd, each of shape (joints,), before they are proposed.
         tell: called from time to time.
-        cancelled: asked from time to time; True ends the search with what it has.
+        cancelled: called from time to time; True ends the search with what it has.
 
     Raises:
         MotionRefused: limits are missing or contradict each other, home is in collision, or no posture keeps them.

@@ -50,8 +50,8 @@ class TimeIntervals:
     """Enclosed motion on consecutive stretches of time.
 
     Attributes:
-        time: their middles [s], shape (stretches,).
-        half: half their lengths [s], shape (stretches,).
+        time: middles of the stretches [s], shape (stretches,).
+        half: half lengths of the stretches [s], shape (stretches,).
         values: position and its first four derivatives in the middles, each of shape (stretches, joints).
         crackle: bound of the fifth derivative, shape (joints,).
     """
@@ -76,7 +76,7 @@ def stretches(path: Path, longest: float | None = None) -> TimeIntervals:
 
     Args:
         path: the motion.
-        longest: their greatest length [s]; by default a small part of the fastest oscillation.
+        longest: greatest length of the stretches [s]; by default a small part of the fastest oscillation.
     """
     edges = []
     for begin, end in path.distinct:
@@ -107,8 +107,8 @@ class PeakBounds:
         torque: largest size, or None where no model is known.
         power: the most that the supply gives [W], or None where nothing is known of it.
         motors: torque of motors that share joints, largest size [N m], None where there are none or no model is known.
-        when: by name of the above, the times [s] near which the bounds are reached; one number for power.
-        slack: by name, the most by which a bound exceeds the largest sample; one number for power.
+        when: times [s] near which the bounds are reached, by name of the above; one number for power.
+        slack: most by which a bound exceeds the largest sample, by name; one number for power.
     """
 
     lowest: Array
@@ -159,7 +159,7 @@ def demands(path: Path, model: ArmModel) -> PeakBounds:
 
     Args:
         path: the motion.
-        model: its prior parameters give the torque.
+        model: model whose prior parameters give the torque.
     """
     cells = stretches(path)
     position = cells.of(0)
@@ -273,11 +273,11 @@ class Clearance:
     """Proven and sampled smallest distance of a motion.
 
     Attributes:
-        required: the distance asked for [m].
+        required: demanded distance [m].
         lower_bound: no pair is ever closer than this [m]; infinite where there are no pairs.
         sampled: the smallest distance found [m].
-        pair: whose it was, None where there are no pairs.
-        time: when [s].
+        pair: the pair at that distance; None where there are no pairs.
+        time: time of that distance in the motion [s].
     """
 
     required: float
@@ -332,7 +332,7 @@ def certified_along(
 
     Args:
         collision: the pairs.
-        position: from times [s], shape (samples,), to positions [rad or m], shape (samples, joints).
+        position: function from times [s], shape (samples,), to positions [rad or m], shape (samples, joints).
         speed: no joint is ever faster [rad/s or m/s], shape (joints,).
         duration: of the motion [s].
         clearance: distance to be kept [m].
@@ -404,7 +404,7 @@ class Proof:
     """Bounds that hold at every instant of a motion.
 
     Attributes:
-        demands: on the joints and the supply.
+        demands: demands on the joints and the supply.
         clearance: the smallest distance, None where the arm has no geometry.
         approach: the smallest distance on the straight way from home to where the motion begins and back, likewise.
         ways: peak bounds on the slow segments from home and back, home itself included.
@@ -431,7 +431,7 @@ def proof_of(
     Args:
         path: the motion.
         model: of the arm.
-        limits: that the motion may use, also for home and for the speed of the segments to and from it.
+        limits: limits of the motion, also of home and of the speed of the segments to and from it.
         collision: geometry of the arm.
         torque_margin: share of the torque that the motion keeps free for what the model does not know; the
             description's when None.

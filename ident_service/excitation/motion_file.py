@@ -29,7 +29,7 @@ class Excitation:
     """Motion that is ready to run, and the arm it was made for.
 
     Attributes:
-        name: what the motion is for.
+        name: purpose of the motion.
         path: the motion.
         arm_sha256: `motion_sha256` of the arm description.
         made: how it was found and what was proven of it, for people and for the record; JSON values.

@@ -49,19 +49,19 @@ class Task:
     """Complete input of a search.
 
     Attributes:
-        model: with the prior parameters that torque is predicted from.
-        columns: of delta, the parameters that the motion shall teach, shape (base,).
+        model: model with the prior parameters that torque is predicted from.
+        columns: columns of delta that belong to the parameters that the motion shall teach, shape (base,).
         basis: the family of motions.
-        limits: what the motion may use, margins taken off.
-        criterion: to be made small.
-        chosen: for `a_optimal`, places in `columns`; all when None.
-        scale: for `a_optimal`, what deviations are measured in, shape (base,).
+        limits: limits of the motion, margins taken off.
+        criterion: criterion to be minimised.
+        chosen: indices into `columns`, for `a_optimal`; all when None.
+        scale: unit of each parameter's deviation, for `a_optimal`, shape (base,).
         noise: standard deviation of each joint's torque [N m or N], shape (joints,); rows are whitened by it. Ones for
             the condition number, which is the paper's, of the plain rows.
-        friction: of the drives, which the arm falls behind by; not looked at when None.
+        friction: friction of the drives that makes the arm fall behind; not looked at when None.
         rate: samples per second that will be recorded [Hz].
         added: information from earlier recordings, whitened alike, shape (base, base), or None.
-        extra_clearance: kept free beyond the workspace's clearance while the motion lasts [m].
+        extra_clearance: distance kept free beyond the workspace's clearance while the motion lasts [m].
     """
 
     model: ArmModel
@@ -106,7 +106,7 @@ class Value:
     """Value and gradient of a criterion at one information matrix.
 
     Attributes:
-        value: to be made small.
+        value: value of the criterion, to be minimised.
         gradient: symmetric, shape (base, base): the value changes by `sum(gradient * dG)`.
     """
 
@@ -124,11 +124,11 @@ def criterion(
     """Evaluate a criterion and its gradient.
 
     Args:
-        kind: of criterion.
+        kind: kind of criterion.
         G: information matrix, shape (base, base).
         sharpness: exponent of the condition number's power means.
-        chosen: for `a_optimal`, which parameters; all when None.
-        scale: for `a_optimal`, what a deviation of each parameter is measured in, shape (base,).
+        chosen: indices of the parameters, for `a_optimal`; all when None.
+        scale: unit of each parameter's deviation, for `a_optimal`, shape (base,).
     """
     eigenvalues, V = np.linalg.eigh(G)
     eigenvalues = np.maximum(eigenvalues, _FLOOR * max(float(eigenvalues[-1]), _NOTHING))
@@ -188,8 +188,8 @@ class State:
 
     Attributes:
         coefficients: of the basis, shape (joints, size).
-        criterion: its value and gradient with respect to the information.
-        limits: by name, shares beyond the limit, not positive where it is kept.
+        criterion: value of the criterion, and gradient with respect to the information.
+        limits: excess over each limit as a share of it, by name; not positive where the limit is kept.
     """
 
     coefficients: Array
@@ -209,7 +209,7 @@ class Problem:
         """Prepare the time grid.
 
         Args:
-            task: what to search.
+            task: task of the search.
             per_period: samples per period.
         """
         self.task = task
@@ -295,7 +295,7 @@ class Problem:
 
         Args:
             x: variables, shape (size,).
-            share: of a limit.
+            share: least share of a limit that counts.
         """
         X = self.coefficients(x)
         found: set[Peak] = set()

@@ -108,7 +108,7 @@ class NoiseModel:
     Attributes:
         deviation: per joint [N m or N], shape (joints,).
         inflation: standard deviations of parameters against those that white noise would give.
-        source: where it comes from, for people.
+        source: origin of the numbers, for people.
     """
 
     deviation: Array
@@ -209,9 +209,9 @@ class FollowingError:
         """Build the inertia response of the prior model.
 
         Args:
-            model: with prior parameters.
-            limits: for the gains.
-            friction: of the drives, as much of it as the law does not know (`unknown_friction`).
+            model: model with prior parameters.
+            limits: limits with the controller's gains.
+            friction: friction of the drives, as much of it as the control law does not know (`unknown_friction`).
             creep: velocity over which a joint's Coulomb friction turns round [rad/s or m/s], shape (joints,).
 
         Raises:
@@ -268,8 +268,8 @@ def predict_following_error(
 
     Args:
         model: of the arm; its description says which share of the friction is fed forward.
-        limits: for the gains.
-        friction: expected of the drives.
+        limits: limits with the controller's gains.
+        friction: expected friction of the drives.
         position: [rad or m], shape (samples, joints).
         velocity: [rad/s or m/s], shape (samples, joints).
     """

@@ -97,7 +97,7 @@ def local_search(
 
     Args:
         problem: of the search.
-        x: where to begin, shape (problem.size,).
+        x: variables to begin with, shape (problem.size,).
         safe: coefficients of standing still in a posture that keeps all limits.
         start: number of the random start.
         check: called at every evaluation; what it raises ends the rounds.
@@ -256,7 +256,7 @@ class Budget:
     """Limits of time and of random starts that end a search; at least one of both.
 
     Attributes:
-        seconds: by the clock.
+        seconds: time by the clock [s].
         starts: random starts.
         workers: processes; with one, the search runs in the calling process.
         clock: time that passes [s]: `time.process_time` counts the work of one worker, however busy the machine is.
@@ -284,10 +284,10 @@ class Progress:
 
     Attributes:
         phase: `starts` or `polish`.
-        finished: starts so far.
+        finished: number of finished starts so far.
         best: value of the criterion so far, or None.
         elapsed: [s].
-        remaining: what is expected to be left [s].
+        remaining: expected time to the end [s].
     """
 
     phase: str
@@ -303,8 +303,8 @@ class SearchResult:
 
     Attributes:
         seed: of the random starts.
-        finished: starts so far; the next one has this number.
-        seconds: spent so far [s].
+        finished: number of finished starts so far, which is the number of the next one.
+        seconds: time spent so far [s].
         candidates: the best ones, best first; each keeps every limit at the samples of its grid.
     """
 
@@ -327,14 +327,14 @@ def search(
     """Search for the best motion until the budget is used up, or the search is cancelled.
 
     Args:
-        task: what to search.
+        task: task of the search.
         safe: a posture that keeps all limits, shape (joints,).
         seed: of the random starts.
-        budget: when to stop.
+        budget: budget of time and starts.
         per_period: samples per period of the starts.
         tell: called from time to time.
-        cancelled: asked from time to time; True ends the search with what it has.
-        earlier: of a search for the same task with the same seed, to go on from.
+        cancelled: called from time to time; True ends the search with what it has.
+        earlier: earlier search for the same task with the same seed, to go on from.
 
     Returns:
         At least one candidate: standing still in the safe posture, if nothing else.
@@ -360,12 +360,12 @@ def polished(
     """Polish a motion for another task than that which it was found for, in this process.
 
     Args:
-        task: what to search.
-        coefficients: of the motion, shape (joints, size).
+        task: new task.
+        coefficients: coefficients of the motion, shape (joints, size).
         safe: a posture that keeps all limits, shape (joints,).
         start: number of the random start that it came from.
         per_period: samples per period of the starts.
-        stopped: asked at every evaluation; True ends the polish with what it has.
+        stopped: called at every evaluation; True ends the polish with what it has.
     """
 
     def check() -> None:
@@ -641,9 +641,9 @@ def read_found(file: Path, task: Task, seed: int) -> SearchResult:
     """Read a search that is to be resumed.
 
     Args:
-        file: what `found_to_json` made.
-        task: that it shall go on with.
-        seed: likewise.
+        file: file that `found_to_json` made.
+        task: task of the resumed search, which must be that of the file.
+        seed: seed of the resumed search, which must be that of the file.
 
     Raises:
         UsageError: no such file, not a search, or the search of another task.

@@ -42,9 +42,9 @@ class Case:
     """Deviation of a simulated arm from its description.
 
     Attributes:
-        words: what is different.
-        friction: times the expected friction.
-        weight: times the modelled inertia of every link.
+        words: difference of the arm from its description, in words.
+        friction: factor of the expected friction.
+        weight: factor of the modelled inertia of every link.
     """
 
     words: str
@@ -110,7 +110,7 @@ class Tracking:
 
         Args:
             time: middles of cells of time in the motion [s], shape (cells,).
-            half: their half widths [s], shape (cells,).
+            half: half widths of the cells [s], shape (cells,).
         """
         time = np.where(time > self.repeats_from, time - self.repeated, time)
         last = len(self.tube) - 1
@@ -180,7 +180,7 @@ def segment_tube_width(path: Path, model: ArmModel, margin: float) -> Callable[[
     Args:
         path: the segments.
         model: of the arm, with prior parameters.
-        margin: as of `track`.
+        margin: margin, as for `track`.
 
     Returns:
         How far the arm may be from its reference, as `Tracking.width`.

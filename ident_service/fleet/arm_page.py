@@ -55,8 +55,8 @@ def arm_page(folder: Path, shown: ArmShown) -> str:
     """Return the page of an arm as HTML.
 
     Args:
-        folder: with the arm's files and its evidence.
-        shown: what the fleet says of it.
+        folder: folder with the arm's files and its evidence.
+        shown: what the page shows of the fleet's result.
     """
     parameters, config = read_parameters(folder / PARAMETERS), arm_from_json(folder / ARM)
     evidence, found = read_evidence(folder / EVIDENCE), assess(parameters.content)

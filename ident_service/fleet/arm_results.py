@@ -68,8 +68,8 @@ class Leaves:
     """Factors of one arm, in the order in which they are merged.
 
     Attributes:
-        keys: of the factors, by the hashes of their recordings.
-        count: of those that are fitted to before the others, a third, judge: the first ones.
+        keys: keys of the factors, by the hashes of their recordings.
+        count: number of the first factors, which are fitted to; the others, a third, judge.
     """
 
     keys: tuple[str, ...]
@@ -109,9 +109,9 @@ class Branches:
     """Information of an arm, merged when it is asked for.
 
     Attributes:
-        leaves: its factors.
+        leaves: factors of the arm.
         described: the arm.
-        store: of the factors.
+        store: store of the factors.
         before: information of the factors that are fitted to, and of those held out, where tasks of their own merged
             them, as many factors need; or the keys of those that are missing.
     """
@@ -159,11 +159,11 @@ class ArmFits:
     """Fits of one arm from its own recordings.
 
     Attributes:
-        leaves: of the arm.
-        fit: from all recordings.
-        trained: from those that are not held out.
-        single: from the first one.
-        held: information of those held out, without clusters; None where there is one recording only.
+        leaves: factors of the arm.
+        fit: fit to all recordings.
+        trained: fit to the recordings that are not held out.
+        single: fit to the first recording.
+        held: information of the recordings held out, without clusters; None where there is one recording only.
         alone: torque errors of `trained` and `single`, inside the feasible set, on those held out [percent].
         merged: information of all recordings; None where everything above was in the store.
     """
@@ -190,7 +190,7 @@ def arm_fits(
         store: of the factors.
         between: variance of what differs from recording to recording [SI^2], shape (base,).
         trained: information of the factors that are fitted to, as of `Branches.before`.
-        held: information of those held out, likewise.
+        held: information of the factors held out, as of `Branches.before`.
 
     Returns:
         The fits; or the keys of the factors that are not there, or are damaged.
@@ -233,9 +233,9 @@ def errors_held_out(
     """Return the torque errors on recordings held out [percent], alone and drawn to the other arms.
 
     Args:
-        fits: of an arm with recordings held out.
-        arm: its name.
-        common: model of what is not held out, of all arms.
+        fits: fits of an arm with recordings held out.
+        arm: name of the arm.
+        common: common model of all arms, without the recordings held out.
         described: the arm.
 
     Returns:
@@ -261,8 +261,8 @@ def stored_fit(
     """Return `arm_fit` of merged factors, from the store where it has been made.
 
     Args:
-        information: gives them merged.
-        of: their keys, in the order in which they are merged, and whether each recording is one cluster.
+        information: function that returns the merged factors.
+        of: keys of the factors, in the order in which they are merged, and whether each recording is one cluster.
         described: the arm.
         store: of the factors.
     """
@@ -341,9 +341,9 @@ def arm_files(
         described: the arm, with numbers for all that could be chosen.
         found: common model of all arms.
         config: the description as it was read, as JSON.
-        more: what the fleet says of it: `arm`, `pooled`, `arms`, `held_out_percent`.
+        more: fields of the summary that come from the fleet: `arm`, `pooled`, `arms`, `held_out_percent`.
         store: of the factors.
-        shown: what the page shows besides.
+        shown: further content of the page.
     """
     leaves = fits.leaves
 
@@ -367,12 +367,12 @@ def side_files(
     """Return the files of the results from some recordings of an arm, before or after a change.
 
     Args:
-        keys: of their factors, in the order in which they are merged.
-        merged: those, where further tasks merged them.
+        keys: keys of the recordings' factors, in the order in which they are merged.
+        merged: merged factors, where further tasks merged them; else None.
         recordings: name and hash of each.
         described: the arm, with numbers for all that could be chosen.
         config: the description as it was read, as JSON.
-        more: what the fleet says of it: `arm`, `pooled`, `arms`.
+        more: fields of the summary that come from the fleet: `arm`, `pooled`, `arms`.
         store: of the factors.
     """
 

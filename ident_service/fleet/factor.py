@@ -81,7 +81,7 @@ class Part:
     Attributes:
         source: the file.
         number: of the piece, from 0.
-        of: pieces that the file is cut into, alike in time.
+        of: number of pieces that the file is cut into, alike in time.
     """
 
     source: Source
@@ -100,22 +100,22 @@ class Row:
 
     Attributes:
         key: name of its factor.
-        sha256: of the file.
+        sha256: hash of the file.
         label: of the piece, see `Part`.
-        stamp: of the first sample [s since 1970 where the recording's clock says so].
-        seconds: from the first to the last sample [s].
+        stamp: stamp of the first sample [s since 1970 where the recording's clock says so].
+        seconds: time from the first to the last sample [s].
         rate: of the samples [Hz].
         beta: unconstrained estimate from this recording alone, shape (base,).
         deviations: standard deviations on the careful side, shape (base,); infinite where it saw nothing.
-        covariances: of the parameters of each group of `parameter_groups`, in its order.
-        blocks: clusters that they were estimated from.
+        covariances: covariances of the parameters of each group of `parameter_groups`, in its order.
+        blocks: number of clusters that the covariances were estimated from.
         noise: root mean square of what the estimate leaves of each joint's torque [N m or N], shape (joints,).
         torque: root mean square of each joint's torque [N m or N], shape (joints,).
         error: relative torque error (eq. 84) [percent].
-        gaps: in the stamps.
+        gaps: number of gaps in the stamps.
         saturated: share of samples at a torque limit, of the joint where it is largest.
         warnings: what is wrong with the recording, in words.
-        conditions: that the recording carries: `temperature` [degrees Celsius], `operating_hours` [h].
+        conditions: conditions that the recording carries: `temperature` [degrees Celsius], `operating_hours` [h].
     """
 
     key: str
@@ -179,7 +179,7 @@ class Problem:
         label: of the piece, see `Part`.
         kind: `recording` for what is wrong with it, `storage` where it could not be read, `worker` where it ended
             every process that tried, `version` where a worker has another version of this package.
-        message: in words.
+        message: reason in words.
     """
 
     url: str
@@ -203,10 +203,10 @@ class Merged:
     """Information of some recordings of one arm.
 
     Attributes:
-        moving: of rows in motion.
-        near: of rows near standstill.
-        clusters: of all rows, those near standstill as their recording weighs them; independent evidence each.
-        samples: smoothed samples that went in.
+        moving: information of the rows in motion.
+        near: information of the rows near standstill.
+        clusters: clusters of all rows, those near standstill as their recording weighs them; independent evidence each.
+        samples: number of smoothed samples used.
     """
 
     moving: Information
@@ -299,7 +299,7 @@ class Settled:
     """Description with every choice as a number.
 
     Attributes:
-        description: as JSON.
+        description: the settled description as JSON.
         pilots: URLs of the recordings that decided.
     """
 
@@ -352,7 +352,7 @@ def settle(sources: Sequence[Source], description: str) -> Settled | tuple[Probl
 
     Args:
         sources: the recordings, of which the first few that can be used decide.
-        description: as JSON.
+        description: the description as JSON.
 
     Returns:
         The settled description; or what is wrong with each recording, where none can be used.
@@ -403,7 +403,7 @@ def reduce_recording(part: Part, described: Described, store: Store, version: st
         part: to reduce.
         described: the arm, with numbers for all that could be chosen.
         store: of the factors.
-        version: of the client's package.
+        version: version of the client's package.
         again: whether to compute it although it is there.
     """
     source = part.source
@@ -614,7 +614,7 @@ def merge_stored(keys: Sequence[str], described: Described, store: Store, whole:
     Args:
         keys: of the factors.
         described: the arm.
-        store: of the factors.
+        store: store of the factors.
         whole: whether a recording is one cluster, for arms with enough of them.
 
     Returns:

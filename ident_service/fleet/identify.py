@@ -73,8 +73,8 @@ def identify_fleet(
     """Identify a fleet and write the results.
 
     Args:
-        request: what is asked for.
-        folder: where results go; an earlier result there is replaced as a whole.
+        request: recordings, description and options.
+        folder: folder of the results; an earlier result there is replaced as a whole.
         tell: called with a line at each step.
         step: called with what is being done and how much of all is done, from 0 to 1.
 

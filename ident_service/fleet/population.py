@@ -81,11 +81,11 @@ class ArmFit:
 
     Attributes:
         fit: weighted least squares.
-        doubt: its covariance and deviations, from blocks or recordings.
-        clusters: that they come from.
+        doubt: covariance and deviations of the fit, from blocks or recordings.
+        clusters: number of clusters that covariance and deviations were estimated from.
         precision: inverse of the covariance as the fleet weighs it, shape (base, base), singular where unseen.
-        total: information that it solves.
-        error: of its torque on all rows.
+        total: information that the fit solves.
+        error: torque error on all rows.
     """
 
     fit: LeastSquares
@@ -123,9 +123,10 @@ def arm_fit(merged: Merged, method: str, between: Array | None = None) -> ArmFit
     """Estimate one arm from merged factors.
 
     Args:
-        merged: its information.
+        merged: merged factors of the arm.
         method: `ols` gives all joints the same weight.
-        between: as of `ArmFit.weighed`; None where recordings are the clusters, whose covariance has it already.
+        between: variances between recordings, as for `ArmFit.weighed`; None where recordings are the clusters, whose
+            covariance has them already.
     """
     fitted = merged.fitted
     total = fitted.total
@@ -150,9 +151,9 @@ class Population:
         scale: D, the size of each parameter that makes 1 N m (root mean square), shape (base,).
         tau: standard deviation between arms of the torque of each group's parameters (root mean square) [N m or N].
         mean: base parameters that are common, mu, shape (base,).
-        covariance: of them, shape (base, base).
+        covariance: covariance of the mean, shape (base, base).
         variances: T, between arms, shape (base,).
-        without: T as the other arms alone have it, per arm, shape (arms, base).
+        without: T estimated from the other arms alone, per arm, shape (arms, base).
         precisions: C_i^-1 of every arm, shape (arms, base, base).
         right: C_i^-1 times the arm's estimate, shape (arms, base).
     """
@@ -194,8 +195,8 @@ def population(fits: Mapping[str, ArmFit], groups: Mapping[Group, Sequence[int]]
     """Estimate the common parameters and how far arms differ from them.
 
     Args:
-        fits: of each arm, at least one.
-        groups: places of each group's parameters.
+        fits: fit of each arm, at least one.
+        groups: indices of each group's parameters.
     """
     arms = tuple(fits)
     scale, residual = _torque_scale(fits)
@@ -305,11 +306,11 @@ def _drawn_to_group(own: Array, variances: Array, expected: Array, share: Array,
     """Return variances of parameters drawn to those of their groups, the more the fewer arms know them, shape (base,).
 
     Args:
-        own: to draw, shape (base,).
+        own: variances to draw, shape (base,).
         variances: T at which the expectation is.
-        expected: of (M r)^2, per arm and parameter, shape (arms, base).
-        share: that each parameter has in the mean of its group, shape (groups, base).
-        member: which parameters each group has, shape (groups, base).
+        expected: expectation of (M r)^2, per arm and parameter, shape (arms, base).
+        share: share of each parameter in the mean of its group, shape (groups, base).
+        member: mask of each group's parameters, shape (groups, base).
     """
     size = (share @ own) @ member
     # Arms that would show a variance of the usual size: 1 for one that knows the parameter, 0 where it does not.
@@ -369,12 +370,12 @@ def arm_estimate(
     """Return one arm's estimate inside its feasible set, as `ident identify` has it.
 
     Args:
-        alone: its unconstrained estimate.
-        merged: its information.
+        alone: unconstrained estimate of the arm alone.
+        merged: merged factors of the arm.
         recordings: name and hash of each.
         described: the arm.
-        pooled: its estimate drawn to the fleet's; that of the arm alone when None.
-        arms: of the fleet; how far they differ is known the less, the fewer they are.
+        pooled: estimate of the arm, drawn to the fleet's; `alone` when None.
+        arms: number of arms in the fleet; how far they differ is known the less, the fewer they are.
 
     Raises:
         SolverError: the solver stopped without an optimum.
@@ -437,11 +438,11 @@ class Unlike:
     Attributes:
         arm: name.
         group: kind and number of joint or link.
-        test: that the arm is one of the others' population.
-        p: of it, after Holm over all arms and groups.
+        test: test of the hypothesis that the arm is one of the others' population.
+        p: p-value of the test, after Holm's correction over all arms and groups.
         torque: root mean square of the difference's torque on the arm's motion, of the joint where it is most [N m].
-        joint: that joint, from 0.
-        share: of that joint's torque.
+        joint: index of that joint, from 0.
+        share: the difference's torque as a share of that joint's torque.
     """
 
     arm: str
@@ -468,9 +469,9 @@ def unlike(
     """Test of every arm and group whether the arm differs from the others by more than they do among themselves.
 
     Args:
-        fits: of each arm alone.
+        fits: fit of each arm alone.
         found: the common model.
-        groups: places of each group's parameters.
+        groups: indices of each group's parameters.
         leading: link parameter that each base parameter is named after.
     """
     every = []
@@ -511,9 +512,9 @@ class Shares:
     """Variances of each base parameter by where they come from, SI units squared, shape (base,) each.
 
     Attributes:
-        arms: between arms.
-        recordings: between recordings of one arm.
-        noise: of one recording's estimate.
+        arms: variance between arms.
+        recordings: variance between recordings of one arm.
+        noise: variance of one recording's estimate by noise.
     """
 
     arms: Array
@@ -532,8 +533,8 @@ def variance_shares(rows: Mapping[str, Sequence[Row]], groups: Mapping[Group, Se
     """Split the variance of each parameter over arms, recordings and noise.
 
     Args:
-        rows: of each arm's recordings.
-        groups: places of each group's parameters.
+        rows: rows of each arm's recordings, by arm.
+        groups: indices of each group's parameters.
     """
     size = len(next(iter(rows.values()))[0].beta)
     found = np.zeros((3, size))
@@ -562,8 +563,8 @@ def _excess(sets: Sequence[Array], sure: float = 0.0) -> float:
     """Return the variance of values beyond their own, pooled over sets of (value, variance), by moments; at least 0.
 
     Args:
-        sets: of values with their variances.
-        sure: deviations that the sum of squares must be above its expectation; else the variance is 0.
+        sets: sets of values with their variances.
+        sure: number of deviations by which the sum of squares must exceed its expectation; else the variance is 0.
     """
     excess = degrees = 0.0
     count = 0
@@ -581,8 +582,8 @@ class HeldOut:
     """Torque errors on recordings that no estimate has seen [percent], inside the feasible set.
 
     Attributes:
-        alone: of each arm's own estimate.
-        pooled: of its estimate drawn to the fleet's.
+        alone: error of the arm's own estimate, by arm.
+        pooled: error of the estimate drawn to the fleet's, by arm.
     """
 
     alone: Mapping[str, float]

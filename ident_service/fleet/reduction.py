@@ -69,14 +69,14 @@ class FleetRequest:
 
     Attributes:
         arm: description of every arm, file or name of a shipped one.
-        patterns: of recordings: files, folders, globs, or URLs that fsspec knows.
+        patterns: patterns of the recordings: files, folders, globs, or URLs that fsspec knows.
         store: URL of the factors.
         names: regular expression whose group `arm` is the arm's name in a recording's URL; its group `date`, an ISO
             date or time, is when it was recorded. The name of the recording's folder when None.
         scheduler: address of a Dask scheduler; an embedded one when None.
-        workers: processes of an embedded scheduler; one per core when None.
-        memory: limit of each of them, as Dask writes it.
-        piece_bytes: of a file, beyond which it is cut into pieces.
+        workers: number of processes of an embedded scheduler; one per core when None.
+        memory: memory limit of each worker, as Dask writes it.
+        piece_bytes: size of a file beyond which it is cut into pieces [bytes].
         settle_again: whether choices are made anew although the store has them.
     """
 
@@ -97,8 +97,8 @@ class Recorded:
 
     Attributes:
         url: of its file.
-        row: its own estimate.
-        at: when it was recorded [s since 1970].
+        row: estimate from the recording.
+        at: time of the recording [s since 1970].
     """
 
     url: str
@@ -117,11 +117,11 @@ class Reduced:
 
     Attributes:
         described: the arms, with numbers for all that could be chosen.
-        pilot: URLs of the recordings that chose them; empty where there was nothing to choose.
+        pilot: URLs of the recordings that decided the choices; empty where there was nothing to choose.
         arms: recordings of each arm, by time.
-        problems: why recordings were left out.
-        computed: factors that were computed, the others having been in the store.
-        parts: that were asked for.
+        problems: reasons why recordings were left out.
+        computed: number of factors computed, the others having been in the store.
+        parts: requested parts.
     """
 
     described: Described
@@ -242,8 +242,8 @@ def result_of(future: Future, what: str) -> Any:
     """Wait for the result of a task.
 
     Args:
-        future: of the task.
-        what: it does, in words, for the error.
+        future: future of the task.
+        what: description of the task, for the error.
 
     Raises:
         Unavailable: it ended every worker that tried.
@@ -261,9 +261,9 @@ def in_order(
 
     Args:
         client: of the scheduler.
-        function: to run; running it twice does nothing more.
-        tasks: its arguments.
-        failed: gives the result of a task whose every worker died.
+        function: function to run; running it twice does nothing more.
+        tasks: arguments of each task.
+        failed: function that returns the result of a task, by its number, whose every worker died.
     """
     workers = max(len(client.scheduler_info(n_workers=-1)["workers"]), 1)
     waiting = iter(range(len(tasks)))
@@ -332,8 +332,8 @@ def reduce_fleet(
 
     Args:
         client: of the scheduler.
-        request: what to reduce.
-        listed: its recordings.
+        request: request with the arm, the store and the options.
+        listed: list of the recordings.
         tell: called with a line at each step.
         step: called with what is being done and how much of all is done, from 0 to 1.
 
@@ -489,7 +489,7 @@ def reduce_again(client: Client, reduced: Reduced, keys: Collection[str], store:
 
     Args:
         client: of the scheduler.
-        reduced: what they are of.
+        reduced: reduced fleet that the factors belong to.
         keys: of the factors.
         store: of the factors.
 
@@ -519,7 +519,7 @@ def merged_on_workers(
         keys: of the factors, in the order in which they are merged.
         described: the arm.
         store: of the factors.
-        whole: as of `merge_stored`.
+        whole: as for `merge_stored`.
     """
     if len(keys) <= AT_ONCE:
         return None

@@ -40,12 +40,12 @@ class FleetResult:
     """Result of the identification of a fleet.
 
     Attributes:
-        folder: where everything is.
+        folder: folder of the results.
         reduced: recordings, and why some were left out.
         found: the common model.
         shares: where each parameter's variance comes from.
-        several: errors on held-out recordings, of arms with several recordings as they are.
-        single: the same of one recording of each.
+        several: errors on held-out recordings of arms with several recordings, as these are.
+        single: errors on held-out recordings with one recording of each arm alone.
         compared: the tests of each arm against the others, and over time.
         document: the content of `fleet.json`.
     """
@@ -92,9 +92,9 @@ def fleet_document(
     """Return the content of `fleet.json`, but for the alarms.
 
     Args:
-        result: what was found.
-        summaries: of each arm's estimate.
-        sha256: of the description as it was read.
+        result: result of the identification.
+        summaries: summary of each arm's estimate.
+        sha256: hash of the description as it was read.
     """
     reduced, found, described = result.reduced, result.found, result.reduced.described
     base = described.base
@@ -336,7 +336,7 @@ def arm_trends(
 
     Args:
         arm: name.
-        reduced: recordings.
+        reduced: fleet with its recordings.
         compared: the tests over time.
         common: base parameters that are common [SI], shape (base,).
         most: number of groups; all when None.

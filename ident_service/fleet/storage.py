@@ -38,8 +38,8 @@ class Source:
 
     Attributes:
         url: path of a local file, else with its protocol.
-        size: [bytes].
-        state: what storage says of the file's version, without reading it.
+        size: size of the file [bytes].
+        state: version of the file as storage tells it without reading the file.
     """
 
     url: str
@@ -70,9 +70,9 @@ def persistently(action: Callable[[], _Result], url: str, pauses: Sequence[float
     """Call a function that uses storage, and again after pauses where it failed for a reason that may pass.
 
     Args:
-        action: to do; it can be repeated.
-        url: for messages.
-        pauses: before each further attempt [s].
+        action: function to call; it can be repeated.
+        url: URL for messages.
+        pauses: waiting times before each further attempt [s].
 
     Raises:
         FileNotFoundError: there is no such file.

@@ -50,9 +50,9 @@ class Scatter:
     """Scatter of the estimates of one group from recording to recording of one arm.
 
     Attributes:
-        variances: added to each estimate's covariance [SI^2], shape (parameters of the group,).
-        factor: that the sum is multiplied by, at least 1.
-        degrees: neighbours' differences that it comes from, in the whole fleet.
+        variances: variances added to each estimate's covariance [SI^2], shape (parameters of the group,).
+        factor: factor of the sum, at least 1.
+        degrees: number of neighbours' differences that the scatter was estimated from, in the whole fleet.
     """
 
     variances: Array
@@ -67,18 +67,18 @@ class Change:
     Attributes:
         arm: name.
         group: kind and number of joint or link.
-        drift: whether it is a line over all the time, not a step at a date.
+        drift: whether the change is a line over all the time, not a step at a date.
         at: index of the first recording after it, in time; of a drift, of the first one in its second half.
         before: time of the last recording before [s since 1970]; of a drift, of the first one.
         after: time of the first recording after; of a drift, of the last one.
-        step: of the group's parameters [SI]; of a drift, from its first to its last recording.
+        step: step of the group's parameters [SI]; of a drift, its change from the first to the last recording.
         deviations: of the step [SI].
         statistic: T^2.
-        p: of the change, after Bonferroni over the splits and Holm over the fleet.
-        joint: the one whose torque changes most for its size, from 0.
-        torque_share: of that joint's torque, by which its prediction changes.
-        residual_share: of that joint's residual.
-        changed: whether it is significant and matters.
+        p: p-value of the change, after Bonferroni's correction over the splits and Holm's over the fleet.
+        joint: index of the joint whose torque changes most for its size, from 0.
+        torque_share: change of that joint's predicted torque, as a share of its torque.
+        residual_share: the same change as a share of that joint's residual.
+        changed: whether the change is significant and matters.
     """
 
     arm: str
@@ -103,11 +103,11 @@ class Dependence:
 
     Attributes:
         condition: `temperature` [degrees Celsius] or `operating_hours` [h].
-        place: of the base parameter.
+        place: index of the base parameter.
         slope: [SI per unit of the condition].
-        deviation: of the slope.
-        p: that it is zero, after Holm over all parameters and conditions.
-        recordings: that carry the condition.
+        deviation: standard deviation of the slope.
+        p: p-value of the hypothesis that the slope is zero, after Holm's correction over all parameters and conditions.
+        recordings: number of recordings that carry the condition.
     """
 
     condition: str
@@ -176,9 +176,9 @@ def change_points(
 
     Args:
         arms: recordings of each arm, by time.
-        fits: of each arm, for what its torque and residual are.
-        groups: places of each group's parameters.
-        scatter: between recordings.
+        fits: fit of each arm, from which its torque and residual are known.
+        groups: indices of each group's parameters.
+        scatter: scatter between recordings, by group.
     """
     every: list[Change] = []
     for arm, recordings in arms.items():
@@ -259,9 +259,9 @@ def _degrees(
     """Return the degrees of freedom of a shape's coefficient, and what its T^2 is too large by for estimated weights.
 
     Args:
-        recordings: that saw the group.
-        covariances: of its parameters, shape (recordings, parameters, parameters).
-        shapes: over the recordings, shape (shapes, recordings).
+        recordings: recordings that saw the group.
+        covariances: covariances of the group's parameters, shape (recordings, parameters, parameters).
+        shapes: values of the shapes at the recordings, shape (shapes, recordings).
         scatter: between recordings, whose degrees the part of it has.
 
     Returns:
@@ -330,7 +330,7 @@ class Compared:
     Attributes:
         odd: differences of arms from the others, every arm and group.
         changes: most likely change of every arm and group.
-        dependences: on temperature and operating hours.
+        dependences: regressions on temperature and operating hours.
         scatter: between recordings of one arm, per group.
     """
 
@@ -356,7 +356,7 @@ def compare_arms(
 
     Args:
         arms: recordings of each arm, by time.
-        fits: of each arm alone.
+        fits: fit of each arm alone.
         found: the common model.
         described: the arms.
     """
@@ -376,10 +376,10 @@ def series(recordings: Sequence[Recorded], place: int, number: int, index: int, 
 
     Args:
         recordings: of the arm, by time.
-        place: of the base parameter.
-        number: of its group.
-        index: of it in the group.
-        scatter: of the group, which the interval has in it.
+        place: index of the base parameter.
+        number: number of its group.
+        index: index of the parameter in the group.
+        scatter: scatter of the group, which the interval includes.
 
     Returns:
         Shape (recordings that saw it, 3).

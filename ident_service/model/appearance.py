@@ -70,7 +70,7 @@ class Mesh:
         joint: index of the joint whose frame it stands still in, or WORLD.
         file: the mesh.
         rotation: of the mesh in that frame, shape (3, 3).
-        translation: likewise [m], shape (3,).
+        translation: translation of the mesh in that frame [m], shape (3,).
         scale: of its coordinates, shape (3,).
     """
 
@@ -89,7 +89,7 @@ def visual_meshes(file: Path, kinematics: Kinematics, chain: Chain) -> list[Mesh
 
     Args:
         file: the URDF; meshes are looked for below its folder, those of `package://NAME/...` also without the name.
-        kinematics: which part of it is the arm.
+        kinematics: part of the file that is the arm.
         chain: the arm's; its joints are found by name.
 
     Raises:
@@ -125,7 +125,7 @@ class PlacedLink:
         joint: index of the arm's joint whose frame it stands still in, or WORLD; None where the arm has no such joint.
         carrier: name of that joint in the file; empty for the world.
         rotation: of the link's frame in the joint's, shape (3, 3).
-        translation: likewise [m], shape (3,).
+        translation: translation of the link's frame in the joint's [m], shape (3,).
     """
 
     where: str

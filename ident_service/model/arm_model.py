@@ -22,7 +22,7 @@ class ArmModel:
     """Mechanism with named parameters.
 
     Attributes:
-        config: what it was made from.
+        config: configuration that the model was made from.
         chain: the mechanism.
         layout: names and order of delta.
         prior: CAD parameters, the description's payload included [SI], shape (layout.size,), or None where nothing is

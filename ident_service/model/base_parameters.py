@@ -105,9 +105,9 @@ class BaseParameters:
     Attributes:
         names: link parameter names, the columns of K.
         K: eq. 38, shape (base, link parameters).
-        base: columns P_b selects, increasing, shape (base,); `K[:, base]` is invertible.
+        base: columns that P_b selects, increasing, shape (base,); `K[:, base]` is invertible.
         units: the unit of each base parameter, empty strings where unknown.
-        independence: of each base column, the share of its length that the base columns before it do not explain,
+        independence: for each base column, the share of its length that the base columns before it do not explain,
             shape (base,); None where it is not known.
     """
 

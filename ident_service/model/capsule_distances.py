@@ -49,12 +49,12 @@ def between_segments(
     """Return distances between segments (Ericson, Real-Time Collision Detection, 5.1.9), also parallel and degenerate.
 
     Args:
-        start: of the first segments [m], shape (3, pairs, samples).
-        along: from their start to their end.
-        other_start: of the second ones.
-        other_along: likewise.
+        start: starting points of the first segments [m], shape (3, pairs, samples).
+        along: vectors from start to end of the first segments [m], shape (3, pairs, samples).
+        other_start: starting points of the second segments [m], shape (3, pairs, samples).
+        other_along: vectors from start to end of the second segments [m], shape (3, pairs, samples).
         squares: squared lengths of the first ones [m^2], shape (pairs, 1).
-        other_squares: of the second ones.
+        other_squares: squared lengths of the second ones [m^2], shape (pairs, 1).
 
     Returns:
         Distances, directions from the second to the first, and the shares along the first and the second segment.
@@ -82,7 +82,7 @@ def to_half_spaces(start: Array, along: Array, normal: Array, offset: Array) -> 
 
     Args:
         start: [m], shape (3, pairs, samples).
-        along: from start to end.
+        along: vectors from start to end [m], shape (3, pairs, samples).
         normal: unit vectors, shape (3, pairs, 1).
         offset: [m], shape (pairs, 1).
 
@@ -101,8 +101,8 @@ def to_boxes(start: Array, along: Array, half: Array) -> tuple[Array, Array, Arr
     Of a line that enters the box the deepest point counts, whose negative distance to the nearest face is convex too.
 
     Args:
-        start: in the box's frame [m], shape (3, pairs, samples).
-        along: from start to end.
+        start: starting points in the box's frame [m], shape (3, pairs, samples).
+        along: vectors from start to end [m], shape (3, pairs, samples).
         half: half edges [m], shape (3, pairs, 1).
 
     Returns:
@@ -299,7 +299,7 @@ class _Family:
     """Pairs of a capsule with one kind of solid.
 
     Attributes:
-        rows: their rows among all contacts.
+        rows: rows of these pairs among all contacts.
         capsules: number of all capsules.
     """
 

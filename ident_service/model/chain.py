@@ -34,7 +34,7 @@ class Chain:
         translation: origin of the joint frame in the parent joint frame [m], shape (joints, 3).
         link_rotation: link frame to joint frame, shape (joints, 3, 3).
         link_translation: origin of the link frame in the joint frame [m], shape (joints, 3).
-        gravity: in the base frame [m/s^2], shape (3,).
+        gravity: gravity in the base frame [m/s^2], shape (3,).
         coupling: drive coordinates per joint coordinates, `d = C q` in the joints' units, shape (joints, joints); the
             identity where every joint has its own drive. Drive inertia and friction live on the drives.
     """

@@ -175,9 +175,9 @@ class _Hull:
     """Bounds, about a joint's axis and origin, of where points can be: they lie inside all three.
 
     Attributes:
-        radius: of the cylinder about the axis [m].
-        low: where along the axis it begins [m].
-        high: where it ends [m].
+        radius: radius of the cylinder about the axis [m].
+        low: lower end of the cylinder along the axis [m].
+        high: upper end of the cylinder along the axis [m].
         ball: radius of the ball about the origin [m].
     """
 
@@ -349,9 +349,9 @@ def share_touching(model: ArmModel, within: float, postures: int, seed: int) -> 
     """Return the share of random postures in which the bodies of each pair touch, the moving link first.
 
     Args:
-        model: of an arm, also of one whose bodies always touch.
+        model: model of an arm, also of one whose bodies always touch.
         within: nearer than this counts as touching [m].
-        postures: how many are drawn, within the position limits.
+        postures: number of postures drawn, within the position limits.
         seed: of the draw.
 
     Raises:
@@ -393,7 +393,7 @@ def lowest_point(model: ArmModel) -> Callable[[Array], float]:
     """Create the function that returns the height of the lowest point of the arm.
 
     Args:
-        model: of the arm; links are the capsules of its geometry, and the origins of their frames.
+        model: model of the arm, whose links are taken as the capsules of its geometry and the origins of their frames.
 
     Returns:
         From a position [rad or m], shape (joints,), to the height above the base's origin, against gravity [m].
@@ -466,14 +466,14 @@ class Contact:
 
     Attributes:
         pairs: readable names of their owners, one per pair of solids.
-        clear: what `depths` returns while nothing touches, minus infinity for each pair, shape (len(pairs),).
+        clear: result of `depths` while nothing touches: minus infinity for each pair, shape (len(pairs),).
     """
 
     def __init__(self, model: ArmModel) -> None:
         """Collect the pairs of solids.
 
         Args:
-            model: with geometry and workspace; without any, there are no pairs.
+            model: model with geometry and workspace; without any, there are no pairs.
 
         Raises:
             ModelError: geometry that does not fit the arm.

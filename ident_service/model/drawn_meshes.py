@@ -33,9 +33,10 @@ def joint_triangles(
 
     Args:
         urdf: the file.
-        kinematics: which part of it is the arm.
+        kinematics: part of the file that is the arm.
         chain: the arm's; its joints are found by name.
-        folder: where meshes are, by the last part of the name that the URDF gives them. Nothing else is read.
+        folder: folder of the meshes, which are found by the last part of the name that the URDF gives them; nothing
+            else is read.
 
     Returns:
         Triangles in the frame of a joint, or WORLD [m], shape (triangles, 3, 3), at most `MOST_TRIANGLES`; and why

@@ -27,8 +27,8 @@ class DynamicModel:
     """Arm with known parameters: a pinocchio model, with friction and coupled drives.
 
     Attributes:
-        model: for pinocchio's own algorithms: one position and one velocity per joint, gravity, armature, and damping,
-            dry friction and limits as far as they are known. Where drives move several joints, no joint has an
+        model: model for pinocchio's own algorithms: one position and one velocity per joint, gravity, armature, and
+            damping, dry friction and limits as far as they are known. Where drives move several joints, no joint has an
             armature, damping or friction of its own, and only the methods here know these terms.
         arm: the mechanism and its configuration.
         delta: link parameters, shape (arm.layout.size,).
@@ -70,9 +70,9 @@ class DynamicModel:
         """Return the direction of dry friction after a step (Dahl 1968); exact where no drive reverses in the step.
 
         Args:
-            direction: before it, per drive, between -1 and 1, shape (..., joints); the signs of the first motion, where
-                nothing is known.
-            step: what the joints travel [rad or m], shape (..., joints).
+            direction: direction before the step, per drive, between -1 and 1, shape (..., joints); the signs of the
+                first motion, where nothing is known.
+            step: displacement of the joints in the step [rad or m], shape (..., joints).
 
         Returns:
             Shape (..., joints).
@@ -84,8 +84,8 @@ class DynamicModel:
 
         Args:
             velocity: [rad/s or m/s], shape (..., joints).
-            direction: of dry friction per drive, from `turned`, shape (..., joints); when None, the sign of the
-                drive's velocity: none at rest, and no pre-sliding.
+            direction: direction of dry friction per drive, from `turned`, shape (..., joints); when None, the sign of
+                the drive's velocity: none at rest, and no pre-sliding.
 
         Returns:
             [N m or N], shape (..., joints).
@@ -110,7 +110,7 @@ class DynamicModel:
             position: [rad or m], shape (joints,).
             velocity: [rad/s or m/s], shape (joints,).
             acceleration: [rad/s^2 or m/s^2], shape (joints,).
-            direction: of dry friction, as for `friction`.
+            direction: direction of dry friction, as for `friction`.
 
         Returns:
             [N m or N], shape (joints,).
@@ -148,10 +148,10 @@ def read_back(
     """Read an exported file back, for comparison.
 
     Args:
-        file: what was written.
+        file: the exported file.
         kind: of file.
-        gravity: in the base frame [m/s^2].
-        kinematics: which part of the file is the arm; all of it when None.
+        gravity: gravity in the base frame [m/s^2].
+        kinematics: part of the file that is the arm; all of it when None.
 
     Raises:
         ModelError: it cannot be read.

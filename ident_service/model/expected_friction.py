@@ -47,7 +47,7 @@ def expected_friction(model: ArmModel, limits: MotionLimits, guess: tuple[float,
 
     Args:
         model: of the arm.
-        limits: its full limits.
+        limits: full limits of the arm.
         guess: Coulomb friction, and viscous friction at the velocity limit, in shares of the torque limit: the joint's,
             or, of drives that move several joints, the most that a joint's limit alone asks of the drive.
     """
@@ -68,8 +68,8 @@ class FrictionFeedforward:
     velocity nor drive a limit cycle, and where the reference stands it is the drives' offset.
 
     Attributes:
-        friction: expected of the drives.
-        share: of it that is added.
+        friction: expected friction of the drives.
+        share: share of Coulomb and viscous friction that is added; the offset is added whole.
     """
 
     def __init__(self, friction: ExpectedFriction, share: float, chain: Chain, limits: MotionLimits) -> None:
@@ -77,9 +77,9 @@ class FrictionFeedforward:
 
         Args:
             friction: of the drives.
-            share: of Coulomb and viscous friction to add; the offset is added whole.
-            chain: for which drives move which joints.
-            limits: for the velocity over which Coulomb friction turns round.
+            share: share of Coulomb and viscous friction that is added; the offset is added whole.
+            chain: chain with the coupling of drives and joints.
+            limits: limits that give the velocity over which Coulomb friction changes sign.
         """
         self.friction, self.share = friction, share
         self._coupling = None if np.array_equal(chain.coupling, np.eye(chain.joints)) else chain.coupling

@@ -35,8 +35,8 @@ def advance_dahl_state(direction: Array, step: Array, lengths: Array) -> Array:
     """Return the direction of dry friction after a step.
 
     Args:
-        direction: before it, between -1 and 1, shape (..., drives).
-        step: what the drives travel, none turning round meanwhile [rad or m], shape (..., drives).
+        direction: direction before the step, between -1 and 1, shape (..., drives).
+        step: displacement of the drives, none of which reverses meanwhile [rad or m], shape (..., drives).
         lengths: x0 [rad or m], shape (drives,).
 
     Returns:

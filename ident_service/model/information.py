@@ -193,9 +193,9 @@ def information_of(
     Args:
         H_b: base regressor, shape (joints, base, samples).
         torque: [N m or N], shape (samples, joints).
-        keep: which equations count, shape (samples, joints).
-        joint_supports: from `supports`.
-        row_weights: what each equation is multiplied by, shape (samples, joints); ones when None.
+        keep: mask of the equations that count, shape (samples, joints).
+        joint_supports: result of `supports`.
+        row_weights: factors of the equations, shape (samples, joints); ones when None.
     """
     factors = []
     for joint, support in enumerate(joint_supports):

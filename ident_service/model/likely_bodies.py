@@ -89,7 +89,7 @@ def likely_load(mass: float, center: Array) -> Array:
 
     Args:
         mass: of the load [kg].
-        center: of its mass, in the link's frame [m], shape (3,).
+        center: centre of its mass in the link's frame [m], shape (3,).
     """
     r = (3.0 * mass / (4.0 * np.pi * _DENSITY)) ** (1.0 / 3.0)
     L = mass * ((0.4 * r**2 + center @ center) * np.eye(3) - np.outer(center, center))
@@ -135,7 +135,7 @@ def lines_of(model: ArmModel, link: int) -> Sequence[Capsule]:
 
     Args:
         model: of the arm.
-        link: its number.
+        link: number of the link.
     """
     chain = model.chain
     lengths = np.linalg.norm([*chain.translation[1:], *chain.link_translation], axis=1)
@@ -177,7 +177,7 @@ def perturbed_body(parameters: Array, rng: np.random.Generator) -> Array:
 
     Args:
         parameters: of a real body, shape (10,), see `INERTIAL`.
-        rng: where the draw comes from.
+        rng: random generator of the draw.
     """
     P = pseudo_inertia(parameters)
     size = np.sqrt(np.trace(P[:3, :3]) / P[3, 3])

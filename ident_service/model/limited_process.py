@@ -32,9 +32,9 @@ def run_limited_process(module: str, path: Path, deadline: float, *more: str) ->
     """Run a module on a file and return what it answers.
 
     Args:
-        module: its `main` calls `answer_within`.
+        module: module whose `main` calls `answer_within`.
         path: of the file.
-        more: words after it.
+        more: further arguments after the file's path.
         deadline: how long a busy machine may take [s]; the process limits its own computing.
 
     Raises:
@@ -94,8 +94,8 @@ def answer_within(memory: int, seconds: int, document: Callable[[], dict[str, An
 
     Args:
         memory: bytes of addresses that it may have, libraries included.
-        seconds: that it may compute.
-        document: called without arguments; a JSON object.
+        seconds: largest computing time [s].
+        document: function without arguments that returns a JSON object.
     """
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_AS, (memory, memory))

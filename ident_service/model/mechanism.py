@@ -45,17 +45,18 @@ class Mechanism:
 
     Attributes:
         names: of the joints.
-        parents: joint that each one hangs on; -1 for the world.
-        revolute: whether it turns; otherwise it slides.
-        axes: in the joint's frame, shape (joints, 3).
+        parents: index of the joint that each joint hangs on; -1 for the world.
+        revolute: mask of the joints that turn; the others slide.
+        axes: axis of each joint in its frame, shape (joints, 3).
         rotation: of each joint's frame in its parent's, shape (joints, 3, 3).
-        translation: likewise [m], shape (joints, 3).
+        translation: translation of each joint's frame in its parent's [m], shape (joints, 3).
         bodies: the ten inertial parameters of eq. 13 in the joint's frame [SI], shape (joints, 10).
         armature: [kg m^2 or kg], shape (joints,).
         damping: [N m s/rad or N s/m], shape (joints,).
         dry_friction: [N m or N], shape (joints,).
-        held: where all other movable joints are held [rad or m].
-        gravity: in the frame of the base [m/s^2], shape (3,): the file's; of a URDF, downwards in its root's frame.
+        held: positions at which all other movable joints are held, by name [rad or m].
+        gravity: gravity in the frame of the base [m/s^2], shape (3,): that of the file; of a URDF, downwards in its
+            root's frame.
         frames: name of each link to its joint (-1: the world), and its rotation and translation in that joint's frame.
     """
 
@@ -78,9 +79,9 @@ def read_mechanism(file: TextFile, kind: Kind, kinematics: Kinematics | None = N
     """Read the arm in a file.
 
     Args:
-        file: its name and text.
+        file: name and text of the file.
         kind: of the file.
-        kinematics: which part of it is the arm; all of it when None.
+        kinematics: part of the file that is the arm; all of it when None.
         own: whether this process has just written the file, so that its content is not foreign.
 
     Raises:
@@ -318,9 +319,9 @@ class BadInertia:
     """A mass or inertia in a URDF that no link can have.
 
     Attributes:
-        line: where.
-        link: whose.
-        what: it says.
+        line: line number.
+        link: name of the link.
+        what: the wrong value, in words.
         zero: whether it is a mass of zero, which a frame without a body may have.
     """
 

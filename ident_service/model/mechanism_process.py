@@ -76,10 +76,10 @@ def arm_part(
     """Return the arm's part of a mechanism, and where its locked joints stand.
 
     Args:
-        model: of the whole mechanism, mimicking joints as joints of their own.
+        model: model of the whole mechanism; joints that mimic others are joints of their own.
         part: `base` and `tip`, names of links, and `lock`, positions of joints [rad or m].
         followers: joints that mimic others.
-        file: its name, for errors.
+        file: name of the file, for errors.
 
     Returns:
         The model of the arm, its world at the frame of `base` where that is named, and the positions at which all

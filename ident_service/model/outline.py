@@ -76,10 +76,10 @@ class Edge:
 
     Attributes:
         parent: name of the other; empty for the world.
-        child: its own name.
-        joint: between them.
+        child: name of the link itself.
+        joint: joint between the two.
         moves: whether that joint moves by itself: it is not fixed, and mimics no other.
-        length: from the other link's frame to its own [m].
+        length: distance from the other link's frame to its own [m].
     """
 
     parent: str
@@ -97,7 +97,7 @@ class Outline:
         edges: links and what they hang on.
         roots: links that hang on nothing.
         leaders: joints that others mimic.
-        limits: by joint.
+        limits: limits of the joints, by name.
         capsules: around links with collision geometry, by link, in its frame.
         meshes: links whose geometry no reader of descriptions takes from the file.
         unread: links with a mesh that could not be read.
@@ -119,9 +119,9 @@ class Source:
     Attributes:
         path: of the file.
         kind: of the file.
-        text: in it.
-        table: DH table, of one; with the limits beside its rows.
-        outline: of a URDF or MJCF.
+        text: content of the file.
+        table: DH table; None for other files.
+        outline: outline of a URDF or MJCF; empty for a DH table.
     """
 
     path: Path
@@ -137,7 +137,7 @@ def read_source(path: Path, convention: str | None = None) -> Source:
 
     Args:
         path: a URDF (`.urdf`, `.xml`), an MJCF (`.xml`), or a DH table (`.csv`, `.yaml`).
-        convention: of a DH table that does not say it, `standard` or `modified`.
+        convention: convention of a DH table that does not name its own, `standard` or `modified`.
 
     Raises:
         UsageError: no such file, or of no known kind.
@@ -302,7 +302,7 @@ def urdf_outline(text: str, folder: Path) -> Outline:
 
     Args:
         text: of the file.
-        folder: where it lies; `package://` names are looked for in it and above.
+        folder: folder of the file; `package://` names are looked for in it and above.
     """
     robot = parse_xml(text)
     edges, leaders, limits, carried = [], set(), {}, set()
@@ -591,7 +591,7 @@ def arm_part(outline: Outline, file: str, base: str | None, tip: str | None) -> 
 
     Args:
         outline: of the file.
-        file: its name.
+        file: name of the file.
         base: link that the arm stands on; found when None.
         tip: link that it ends at; found when None.
 

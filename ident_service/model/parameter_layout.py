@@ -61,9 +61,9 @@ def body_parameters(inertia: Array, first: Array, mass: float) -> Array:
     """Return the parameters of eq. 13 of a body, shape (10,).
 
     Args:
-        inertia: about its frame's origin [kg m^2], shape (3, 3).
-        first: its mass times its centre of mass [kg m], shape (3,).
-        mass: its mass [kg].
+        inertia: inertia about the frame's origin [kg m^2], shape (3, 3).
+        first: mass times centre of mass [kg m], shape (3,).
+        mass: mass of the body [kg].
     """
     return np.array([*inertia[np.triu_indices(3)], *first, mass])
 
@@ -188,7 +188,7 @@ class JointDrives:
     """Effect of each joint's own drive; zero where a joint shares drives with other joints.
 
     Attributes:
-        own: which joints have a drive that moves no other, and no other drive, shape (joints,).
+        own: mask of the joints with a drive that moves no other joint, and no further drive, shape (joints,).
         armature: [kg m^2 or kg], shape (joints,).
         damping: [N m s/rad or N s/m], shape (joints,).
         friction: dry friction [N m or N], shape (joints,).

@@ -27,8 +27,8 @@ def read_urdf(
 
     Args:
         file: the URDF.
-        gravity: in the base frame [m/s^2].
-        kinematics: which part of it is the arm; all of it when None.
+        gravity: gravity in the base frame [m/s^2].
+        kinematics: part of the file that is the arm; all of it when None.
 
     Returns:
         The chain, and the ten inertial parameters per link (eq. 13) in SI units, shape (joints, 10).

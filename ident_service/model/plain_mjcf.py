@@ -36,7 +36,7 @@ def build_from_mjcf(path: Path, folder: Path, build: Callable[[str], Any], meshe
 
     Args:
         path: of an MJCF that has passed `require_parser_limits`.
-        folder: where the rewritten file goes. Its owner removes it: what reads the file may break off.
+        folder: folder for the rewritten file. Its owner removes it: what reads the file may break off.
         build: called with the path of that file.
         meshes: folder that the file's own names of meshes begin in; none are read when None.
 

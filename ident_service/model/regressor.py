@@ -54,11 +54,11 @@ def joint_regressor(
         position: [rad or m], shape (samples, joints).
         velocity: [rad/s or m/s], shape (samples, joints).
         acceleration: [rad/s^2 or m/s^2], shape (samples, joints).
-        columns: which parameters, all when None.
-        out: what an earlier call for the same chain and columns and as many samples or more returned; it is written
-            over, which saves the time of fresh memory.
-        direction: what Coulomb friction is multiplied by, per drive, shape (samples, joints); the sign of the drive's
-            velocity when None.
+        columns: indices of the parameters, all when None.
+        out: result of an earlier call for the same chain and columns and as many samples or more; it is written over,
+            which saves the time of fresh memory.
+        direction: direction of Coulomb friction per drive, from -1 to 1, shape (samples, joints); the sign of the
+            drive's velocity when None.
 
     Returns:
         H, shape (joints, columns, samples): joint i's equations are `H[i].T @ delta`.
@@ -296,7 +296,7 @@ class RegressorGradient:
             position: [rad or m], shape (samples, joints).
             velocity: [rad/s or m/s], shape (samples, joints).
             acceleration: [rad/s^2 or m/s^2], shape (samples, joints).
-            direction: what Coulomb friction is multiplied by, per drive, shape (samples, joints).
+            direction: direction of Coulomb friction per drive, from -1 to 1, shape (samples, joints).
 
         Returns:
             H, shape (joints, columns, samples); the next run writes over it.

@@ -74,7 +74,7 @@ class Body:
     Attributes:
         owner: joint name of the link, `base`, `obstacle <name>` or `inside <axis> <side>`.
         joint: index of the joint whose frame the solid stands still in, or WORLD.
-        solid: in that frame.
+        solid: the solid in that frame.
     """
 
     owner: str

@@ -102,7 +102,7 @@ class Program:
         """Plan the run: which steps are needed, and which may use the same memory one after another.
 
         Args:
-            tape: what was recorded.
+            tape: recorded expression graph.
             outputs: the values wanted, in the order of the rows of `run`'s output.
         """
         self._constants = [(row, value) for row, value in enumerate(outputs) if not isinstance(value, Symbol)]
@@ -203,8 +203,8 @@ class Differentiable:
         """Plan the forward and the backward run.
 
         Args:
-            tape: what was recorded; all of its inputs, in the order they were made.
-            inputs: what to differentiate with respect to.
+            tape: recorded expression graph; `run` takes all of its inputs, in the order they were made.
+            inputs: inputs to differentiate with respect to.
             outputs: the values wanted.
         """
         self._outputs = len(outputs)
@@ -271,10 +271,10 @@ class _Backwards:
     """Reverse sweep on a tape of its own.
 
     Attributes:
-        tape: of the sweep; its inputs are seeds and forward values, in the order of `order`.
-        order: what each input is: ("seed", output) or ("kept", place in `known`).
+        tape: expression graph of the sweep; its inputs are seeds and forward values, in the order of `order`.
+        order: meaning of each input: ("seed", output) or ("kept", place in `known`).
         known: forward steps whose values the sweep needs, in the order they were met.
-        adjoints: by forward step, the derivative of `sum(seeds * outputs)` with respect to it.
+        adjoints: derivative of `sum(seeds * outputs)` with respect to each forward step, by step.
     """
 
     def __init__(self, tape: ExpressionGraph, outputs: Sequence[Value]) -> None:
@@ -351,7 +351,7 @@ class TaylorModel:
 
     Attributes:
         c: value in the middle.
-        d: its time derivative there [1/s].
+        d: time derivative in the middle [1/s].
         r: how far the value may be from `c + d s` anywhere on the stretch.
         h: half the length of the stretch [s].
     """
@@ -432,8 +432,8 @@ def enclose(tape: ExpressionGraph, inputs: Sequence[TaylorModel], outputs: Seque
     """Run a tape on enclosures and return the enclosures of its outputs.
 
     Args:
-        tape: what was recorded.
-        inputs: in the order of `ExpressionGraph.input` calls, all of the same stretches.
+        tape: recorded expression graph.
+        inputs: inputs in the order of `ExpressionGraph.input` calls, all of the same stretches.
         outputs: the values wanted.
     """
     chunks = []

@@ -99,7 +99,7 @@ def local_polynomial(values: Array, length: int, degree: int, derivative: int, p
         values: shape (samples, ...), at least `length` samples.
         length: samples of a window, odd and more than `degree`.
         degree: of the polynomial.
-        derivative: its order, 0 for the value itself.
+        derivative: order of the derivative, 0 for the value itself.
         period: of the samples [s].
 
     Returns:
@@ -136,7 +136,7 @@ def spline_shifted(values: Array, steps: float) -> Array:
 
     Args:
         values: shape (samples, columns), at least one sample.
-        steps: how much further on, in samples; negative for back.
+        steps: number of samples further on at which the spline is read; negative for back.
 
     Returns:
         Shape of `values`.

@@ -49,7 +49,7 @@ def falling_joints(model: ArmModel, limits: MotionLimits) -> tuple[str, ...]:
     """Return the names of the joints that gravity moves when their drives are off, with or without a brake.
 
     Args:
-        model: with prior parameters.
+        model: model with prior parameters.
         limits: of the arm.
 
     Raises:
@@ -68,7 +68,7 @@ def after_stop(model: ArmModel, limits: MotionLimits) -> StopSecuring:
     """Return how this arm is secured after a stop: braked, held or lowered.
 
     Args:
-        model: with prior parameters.
+        model: model with prior parameters.
         limits: of the arm.
 
     Raises:
@@ -117,7 +117,7 @@ class Lowering:
     """Lower an arm once, by taking gravity compensation away.
 
     Attributes:
-        share: of gravity to compensate, s.
+        share: share s of gravity to compensate.
     """
 
     def __init__(self, limits: MotionLimits, stamp_ns: int, after: float = 0.0) -> None:
@@ -125,7 +125,7 @@ class Lowering:
 
         Args:
             limits: of the arm.
-            stamp_ns: of the present cycle [ns].
+            stamp_ns: stamp of the present cycle [ns].
             after: how long everything is still compensated [s].
         """
         self.share = 1.0
@@ -145,9 +145,9 @@ class Lowering:
         """Update the share of compensated gravity for one cycle, and return whether the arm has come to rest.
 
         Args:
-            stamp_ns: of the cycle [ns].
+            stamp_ns: stamp of the cycle [ns].
             position: [rad or m], shape (joints,).
-            velocity: filtered [rad/s or m/s], shape (joints,).
+            velocity: filtered velocity [rad/s or m/s], shape (joints,).
 
         Returns:
             Whether the arm rests without compensation.

@@ -29,7 +29,7 @@ def make_arm(config: ArmConfig, clock: Clock | None = None) -> Arm:
     """Create the arm that a configuration describes, not yet open.
 
     Args:
-        config: its `driver.kind` names an entry point of the group `ident_service.drivers`.
+        config: configuration whose `driver.kind` names an entry point of the group `ident_service.drivers`.
         clock: the loop's clock; by default the one the driver section asks for.
 
     Raises:
@@ -68,8 +68,8 @@ class Promise:
 
     Attributes:
         words: the promise.
-        outcome: of trying it.
-        why: it is broken or was not tried; empty where it is kept.
+        outcome: result of trying it.
+        why: reason why it is broken or was not tried; empty where it is kept.
     """
 
     words: str
@@ -89,8 +89,9 @@ def try_driver(config: ArmConfig, confirm: Callable[[str], str], arm: Arm | None
 
     Args:
         config: of the arm.
-        confirm: shows a question and returns what a person typed; asked once, before the arm is energised.
-        arm: not open; the configured one when None.
+        confirm: function that shows a question and returns what a person typed; called once, before the arm is
+            energised.
+        arm: the arm, not open; the configured one when None.
 
     Raises:
         DriverError: nothing is installed that can reach such an arm.

@@ -43,7 +43,7 @@ class Nearest:
     Attributes:
         distance: [m]; infinite where there is nothing to touch.
         pair: names of the two bodies, or None.
-        time: at which the distance is smallest [s].
+        time: time on the motion of the smallest distance [s].
     """
 
     distance: float
@@ -58,8 +58,8 @@ class ClearanceChecker:
         """Prepare the collision model of an arm.
 
         Args:
-            model: with its geometry and surroundings; without any, every way is clear.
-            limits: of the arm, that its stops keep.
+            model: model with its geometry and surroundings; without any, every trajectory is clear.
+            limits: limits of the arm, which its stops keep.
 
         Raises:
             MotionRefused: a pair of bodies that is never free.
@@ -74,8 +74,8 @@ class ClearanceChecker:
         Where the arm stands nearer to something than the clearance, as after a stop, half of that distance is kept.
 
         Args:
-            reference: from rest.
-            limits: that it keeps.
+            reference: trajectory that begins at rest.
+            limits: limits that the trajectory keeps.
 
         Raises:
             MotionRefused: from any of the steps, naming what comes how near to what, and when.
@@ -83,7 +83,7 @@ class ClearanceChecker:
         if not self._collision.pairs:
             return
         yield from self._proven(reference, limits)
-        touching = yield from stops_touching(self._collision, reference, self._limits)
+        touching = yield from trajectory_stop_contact(self._collision, reference, self._limits)
         if touching is not None:
             raise MotionRefused(touching)
 
@@ -112,10 +112,10 @@ class ClearanceChecker:
                 yield
 
 
-def stops_touching(
+def trajectory_stop_contact(
     collision: CollisionModel, reference: Reference, limits: MotionLimits
 ) -> Generator[None, None, str | None]:
-    """Describe a stop out of a trajectory that would touch something, or None; in slices, like `require_clear`."""
+    """Describe the first stop out of a trajectory that touches, by the bodies themselves, or None; in slices."""
     for time in np.arange(0.0, reference.duration, _BEGINS).tolist():
         stopping = stop(reference.at(time), limits)
         yield
@@ -145,7 +145,7 @@ def trajectory_clearance(
     return certified_along(collision, position, limits.velocity, reference.duration, least)
 
 
-def stop_clearance(path: Path, limits: MotionLimits, model: ArmModel) -> Nearest:
+def motion_stop_clearance(path: Path, limits: MotionLimits, model: ArmModel) -> Nearest:
     """Return the smallest distance on stops out of a motion, bodies replaced by capsules around them."""
     capsules = CapsuleModel(model)
     nearest = Nearest(float("inf"), None, 0.0)
@@ -163,9 +163,9 @@ def stop_clearance(path: Path, limits: MotionLimits, model: ArmModel) -> Nearest
     return nearest
 
 
-def touching_stop(path: Path, limits: MotionLimits, model: ArmModel) -> str | None:
+def motion_stop_contact(path: Path, limits: MotionLimits, model: ArmModel) -> str | None:
     """Describe the stop out of a motion that comes nearest to anything; None where no stop touches, by capsules."""
-    nearest = stop_clearance(path, limits, model)
+    nearest = motion_stop_clearance(path, limits, model)
     if nearest.distance > 0.0:
         return None
     return _touches("motion", nearest.time, nearest.pair, nearest.distance)
@@ -175,9 +175,9 @@ def require_clear(model: ArmModel, path: Path, trajectories: Sequence[Reference]
     """Refuse a run that would come too near to anything.
 
     Args:
-        model: of the arm, with its geometry and surroundings; without any, nothing is checked.
+        model: model of the arm, with its geometry and surroundings; without any, nothing is checked.
         path: the motion.
-        trajectories: to it and back from it.
+        trajectories: trajectories to the motion and back from it.
         limits: of the arm.
 
     Raises:
@@ -189,7 +189,7 @@ def require_clear(model: ArmModel, path: Path, trajectories: Sequence[Reference]
     least = model.config.workspace.clearance
     _require_proven("the motion", certified_clearance(collision, path, least), least)
     require_clear_trajectories(model, [("the path to or from the motion", one) for one in trajectories], limits)
-    if touching := touching_stop(path, limits, model):
+    if touching := motion_stop_contact(path, limits, model):
         raise MotionRefused(touching)
 
 
@@ -199,9 +199,9 @@ def require_clear_trajectories(
     """Refuse trajectories that come too near to anything, or out of which a stop would touch something.
 
     Args:
-        model: of the arm, with its geometry and surroundings; without any, nothing is checked.
-        trajectories: each with its name in a refusal.
-        limits: of the arm; none of them is faster.
+        model: model of the arm, with its geometry and surroundings; without any, nothing is checked.
+        trajectories: trajectories, each with its name in a refusal.
+        limits: limits of the arm; no trajectory is faster.
 
     Raises:
         MotionRefused: naming what comes how near to what, and when.
@@ -212,7 +212,7 @@ def require_clear_trajectories(
     least = model.config.workspace.clearance
     for what, reference in trajectories:
         _require_proven(what, trajectory_clearance(collision, reference, limits, least), least)
-        if touching := run_to_end(stops_touching(collision, reference, limits)):
+        if touching := run_to_end(trajectory_stop_contact(collision, reference, limits)):
             raise MotionRefused(touching)
 
 
@@ -266,9 +266,9 @@ def relaxed_limits(position: Vector, limits: MotionLimits, share: float = SAG) -
     """Return limits for a trajectory that begins outside: just wide enough to include the start.
 
     Args:
-        position: where the arm stands [rad or m], shape (joints,).
+        position: present position of the arm [rad or m], shape (joints,).
         limits: of the arm.
-        share: of the following error, that is added where a joint stands outside.
+        share: share of the following error that is added where a joint stands outside.
 
     Returns:
         The limits themselves in all joints that stand inside.

@@ -155,10 +155,10 @@ class ControlFile:
         Only a stop that was asked for after `requested_ns` is there from the beginning.
 
         Args:
-            path: of the file; made where it is missing.
+            path: path of the file, which is made where it is missing.
             lease_seconds: how long the arm may move after `renew` [s]; None for a run that needs no lease.
             now_ns: the lease's clock.
-            requested_ns: when the motion was asked for, on that clock [ns]; when None, no earlier stop counts.
+            requested_ns: time of the motion's request on that clock [ns]; when None, no earlier stop counts.
 
         Raises:
             DriverError: another process moves the arm.
@@ -212,7 +212,7 @@ class ControlFile:
         """Stop the motion of an arm under control, and every motion that was asked for but has not begun.
 
         Args:
-            path: of the file; made where it is missing.
+            path: path of the file, which is made where it is missing.
             now_ns: the clock of `take`.
 
         Returns:

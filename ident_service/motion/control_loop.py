@@ -76,7 +76,7 @@ class Loop:
         ended_by: the fault that stopped the arm under control, if one did.
         lowered: whether the arm rests without torque, so that it can be taken away.
         last: the latest samples.
-        peaks: so far.
+        peaks: peaks of the motion so far.
     """
 
     arm: Arm
@@ -116,8 +116,8 @@ class Loop:
         """Cycle until DONE, or until STOPPED and held.
 
         Args:
-            target: of the first cycle, that holds the arm where it stands, shape (joints,): torque [N m or N], or
-                position [rad or m] of an arm that is given positions.
+            target: target of the first cycle, which holds the arm where it stands, shape (joints,): torque [N m or N],
+                or position [rad or m] of an arm that is given positions.
             first: sample of the first cycle, where `target` has been exchanged already.
 
         Raises:

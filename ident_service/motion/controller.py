@@ -27,13 +27,13 @@ class ComputedTorque:
     """Compute the control law and filter the velocity for it.
 
     Attributes:
-        position: of the last update [rad or m], shape (joints,), predicted where it was not measured.
+        position: position at the last update [rad or m], shape (joints,), predicted where it was not measured.
         velocity: filtered velocity of the last update [rad/s or m/s], shape (joints,).
         correction: feedback part of the last torque, `M(q) (K_d (dq_r - dq) + K_p (q_r - q))` [N m or N],
             shape (joints,); nothing when the arm is only damped.
         feedforward: friction in the last torque [N m or N], shape (joints,); nothing when the arm is only damped.
         answer: feedback acceleration, `K_d (dq_r - dq) + K_p (q_r - q)` [rad/s^2 or m/s^2], shape (joints,); nothing
-            likewise.
+            when the arm is only damped.
     """
 
     def __init__(
@@ -49,11 +49,11 @@ class ComputedTorque:
 
         Args:
             dynamics: the prior model.
-            limits: for the gains.
+            limits: limits of the arm, with the gains.
             period: of the loop [s].
-            velocity_cutoff: of the low-pass [Hz], one or per joint.
-            position: where the arm stands [rad or m], shape (joints,).
-            friction: to feed forward; none when None.
+            velocity_cutoff: cut-off of the low-pass of the velocity [Hz], one or per joint.
+            position: present position of the arm [rad or m], shape (joints,).
+            friction: friction to feed forward; none when None.
         """
         self._dynamics = dynamics
         self._kp, self._kd = limits.kp, limits.kd
@@ -72,10 +72,11 @@ class ComputedTorque:
         """Return the computed torque for the next cycle; updates the velocity filter.
 
         Args:
-            position: measured [rad or m], shape (joints,).
-            valid: where `position` is fresh; elsewhere the arm is taken to have gone on as it went.
-            reference: where it should be.
-            elapsed: since the update before [s]; one period when None; 0 where it is unknown, and the velocity stays.
+            position: measured position [rad or m], shape (joints,).
+            valid: mask of the fresh positions; elsewhere the joint is taken to have gone on as it went.
+            reference: setpoint of the cycle.
+            elapsed: time since the update before [s]; one period when None; 0 where it is unknown, and the velocity
+                stays.
 
         Returns:
             Torque [N m or N], shape (joints,), not yet limited.
@@ -103,10 +104,10 @@ class ComputedTorque:
         Args:
             position: as for `torque`.
             valid: as for `torque`.
-            share: of gravity to compensate.
-            added: tau_0, what else is needed to stand [N m or N], shape (joints,).
+            share: share of gravity to compensate.
+            added: tau_0, further torque that is needed to stand [N m or N], shape (joints,).
             elapsed: as for `torque`.
-            back: e, by how much each joint is to be brought back [rad or m], shape (joints,).
+            back: e, displacement by which each joint is to be brought back [rad or m], shape (joints,).
 
         Returns:
             Torque [N m or N], shape (joints,), not yet limited.

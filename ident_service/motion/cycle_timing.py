@@ -25,7 +25,7 @@ class Histogram:
     """Count times in fixed bins.
 
     Attributes:
-        count: how many.
+        count: number of entries.
         worst_ns: the longest [ns].
     """
 
@@ -81,8 +81,8 @@ def longest_stall(described: float | None, period: float, watchdogs: Iterable[Wa
     Args:
         described: `control.longest_stall` of the arm's description [s].
         period: of the loop [s].
-        watchdogs: of the drives. Half of the shortest time is the most: what comes late must not come too late.
-            Nor is it more than nearly the gap that is called silence.
+        watchdogs: watchdogs of the drives. Half of the shortest time is the most: what comes late must not come too
+            late. Nor is it more than nearly the gap that is called silence.
     """
     times = [one.seconds for one in watchdogs if one.seconds is not None]
     asked = max(LONGEST_STALL, period) if described is None else described
@@ -111,8 +111,9 @@ class Elapsed:
         """Return the time since the last call's stamp [s], half a period to `LONGEST_GAP` periods; a period at first.
 
         Args:
-            stamp_ns: of a sample [ns].
-            doubt_ns: how much earlier it may have been taken [ns]; the time from one that was is the longest possible.
+            stamp_ns: stamp of a sample [ns].
+            doubt_ns: how much earlier than its stamp the sample may have been taken [ns]; the time from one that was is
+                the longest possible.
         """
         gap_ns = self._period_ns if self._before_ns is None else stamp_ns - self._before_ns
         self._unknown = 0 if doubt_ns == self._doubt_ns == 0 else self._unknown + 1
@@ -130,7 +131,7 @@ class Deadlines:
     """Watch the timing of one loop from its first cycle on.
 
     Attributes:
-        lateness_ns: of the last cycle, against the typical one of those before it [ns].
+        lateness_ns: lateness of the last cycle against the typical one of those before it [ns].
         elapsed: time between the last two samples, at most [s], see `Elapsed`.
         known: whether `elapsed` is the true time between them.
         lost: cycles that were late or never came, so far.
@@ -147,10 +148,10 @@ class Deadlines:
         """Start before the first cycle.
 
         Args:
-            findings: makes the faults.
+            findings: counter that makes the faults.
             period: of the loop [s].
             scheduled_stamps: whether stamps are those of a schedule (`ArmDescription`).
-            longest_stall: that is survived [s].
+            longest_stall: longest stall that a motion survives [s].
         """
         self.lateness_ns = self.lost = 0
         self.elapsed = period

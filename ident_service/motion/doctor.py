@@ -57,9 +57,9 @@ class Finding:
     """One thing that was looked at.
 
     Attributes:
-        what: it is.
-        state: how it is.
-        found: in words.
+        what: subject of the finding.
+        state: judgement of it.
+        found: what was found, in words.
         remedy: what to do; empty where nothing is to be done.
     """
 
@@ -74,12 +74,12 @@ class Woken:
     """Lateness of a loop that only sleeps.
 
     Attributes:
-        period: of its slots [s].
-        late: of each slot, until the loop came to it [s], shape (slots,).
-        sentence: what the kernel granted.
+        period: period of the loop's slots [s].
+        late: lateness of the loop in each slot [s], shape (slots,).
+        sentence: description of what the kernel granted.
         stolen: share of all processors' time in which the host of this virtual machine let others run; None where
             the kernel does not tell.
-        faults: pages that the kernel had to find while the loop ran.
+        faults: number of pages that the kernel had to find while the loop ran.
         load: mean number of processes that wanted a processor in the last minute.
     """
 
@@ -106,8 +106,8 @@ class Held:
 
     Attributes:
         rate: [Hz].
-        longest_stall: that such a motion survives [s].
-        stalls: longer ones.
+        longest_stall: longest stall that such a motion survives [s].
+        stalls: number of longer stalls.
         late: share of the cycles that were late or lost in the worst second.
         good: whether no motion would have ended.
     """
@@ -124,7 +124,7 @@ def kernel_findings(settings: Realtime, root: Path = Path("/")) -> list[Finding]
 
     Args:
         settings: of the arm's description.
-        root: below which `proc`, `sys` and `dev` are.
+        root: folder that `proc`, `sys` and `dev` are in.
     """
     return [
         _preemption(root),
@@ -153,11 +153,11 @@ def measure_wake_up(
     """Measure how late a loop is woken that sleeps from slot to slot, as that of a motion does.
 
     Args:
-        rate: of slots [Hz].
-        seconds: how long.
+        rate: rate of the slots [Hz].
+        seconds: duration of the measurement [s].
         settings: of the arm's description.
         clock: the machine's when None.
-        stop_requested: asked in each slot; what was measured until then counts.
+        stop_requested: called in each slot; True ends the measurement, and what was measured until then counts.
     """
     clock = RealClock() if clock is None else clock
     period_ns = round(1e9 / rate)
@@ -187,8 +187,8 @@ def judge_rates(woken: Woken, rate: float, described: float | None, watchdogs: t
     """Judge which rates were held all the time, the highest first.
 
     Args:
-        woken: what was measured.
-        rate: that is judged in any case [Hz], a whole part of the measured one.
+        woken: lateness that was measured.
+        rate: rate that is judged in any case [Hz]; the measured one is a multiple of it.
         described: `control.longest_stall` of the arm's description [s].
         watchdogs: of its drives.
     """

@@ -49,8 +49,8 @@ class EncoderCoordinates:
     """Coordinates in which encoders may stand still: every joint, then every drive that moves several joints.
 
     Attributes:
-        motions: turns velocities of joints into those of the drives, shape (drives, joints).
-        torques: turns torques of joints into those of the drives, shape (drives, joints).
+        motions: matrix from velocities of joints to those of the drives, shape (drives, joints).
+        torques: matrix from torques of joints to those of the drives, shape (drives, joints).
     """
 
     motions: Vector
@@ -139,7 +139,7 @@ class FrozenEncoderObserver:
                 (joints + drives,).
             resolution: smallest step of the positions [rad or m], shape (joints,).
             least: the prior model; the control law's when None.
-            coupling: of the arm, as for `EncoderCoordinates.of`.
+            coupling: coupling of the arm, as for `EncoderCoordinates.of`.
         """
         self._dynamics, self._least, self._period = dynamics, least or dynamics, period
         self._encoders = EncoderCoordinates.of(coupling, len(resolution))
@@ -166,12 +166,12 @@ class FrozenEncoderObserver:
         """Update the missing motion for one cycle, and return which encoders cannot hide it.
 
         Args:
-            direction: in which each position has changed, 1 or -1, or 0 where it has not or was not measured, shape
-                (joints + drives,).
+            direction: direction of each position's change, 1 or -1, or 0 where it did not change or was not measured,
+                shape (joints + drives,).
             correction: feedback torque [N m or N], shape (joints,); all zero where no position is asked for, which
                 allows no conclusion.
             answer: feedback acceleration [rad/s^2 or m/s^2], shape (joints,).
-            position: last known [rad or m], shape (joints,).
+            position: last known position [rad or m], shape (joints,).
             feedforward: friction in the torque [N m or N], shape (joints,).
 
         Returns:

@@ -46,9 +46,9 @@ class StoredFault:
     """Represent an unacknowledged fault on disk.
 
     Attributes:
-        code: its name.
+        code: name of the fault.
         cause: one plain sentence.
-        since: when it was latched [s since 1970 in UTC]; of a motion that was killed, when it began.
+        since: time when it was latched [s since 1970 in UTC]; of a motion that was killed, time when it began.
     """
 
     code: str
@@ -70,9 +70,9 @@ class _Mark:
     """Represent the mark of a moving arm.
 
     Attributes:
-        begun: the fault that it is when its process is gone without a word.
-        faults: that found no other room.
-        ended: whether these are all, and the arm was without torque.
+        begun: the fault of a motion whose process is gone without a word.
+        faults: faults for which there was no other room.
+        ended: whether these faults are all, and the arm was without torque.
         free: offset of the first blank [bytes].
         size: of the file [bytes].
     """

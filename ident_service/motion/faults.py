@@ -68,10 +68,11 @@ class Rule:
     """Represent one row of the fault table.
 
     Attributes:
-        reaction: to the fault.
+        reaction: reaction to the fault.
         means: the possible cause, the end of the sentence that a person reads.
-        often: of a warning, in how many of the last 100 cycles it is still only a warning.
-        becomes: the fault that one more makes of it.
+        often: for a warning, the largest number of the last 100 cycles in which it is found and still is only a
+            warning.
+        becomes: name of the fault that one more such cycle makes of it.
         each: whether every message of a warning is told, not only the first of its code.
     """
 
@@ -171,8 +172,8 @@ class Fault:
     """Represent a fault found in one cycle.
 
     Attributes:
-        code: its name in the table.
-        reaction: to it.
+        code: name of the fault in the table.
+        reaction: reaction to the fault.
         message: one plain sentence: which joint, what was measured, what is allowed, what it may mean.
     """
 
@@ -191,7 +192,7 @@ class FaultCounter:
 
     Attributes:
         cycle: number of the present cycle, advanced by the caller.
-        warnings: how often each warning was found.
+        warnings: number of times that each warning was found, by code.
     """
 
     def __init__(self) -> None:
@@ -203,8 +204,8 @@ class FaultCounter:
         """Return a fault of the table, or the fault that a warning becomes when it is found too often.
 
         Args:
-            code: in the table.
-            what: begins the sentence: which joint, what was measured, what is allowed.
+            code: name of the fault in the table.
+            what: beginning of the sentence: which joint, what was measured, what is allowed.
         """
         rule = FAULTS[code]
         if rule.reaction is Reaction.WARN:
@@ -223,9 +224,9 @@ class ActiveFault:
     """Represent an unacknowledged fault in memory.
 
     Attributes:
-        code: its name.
+        code: name of the fault.
         cause: one plain sentence.
-        since_ns: when it was found, on the loop's clock [ns].
+        since_ns: time when it was found, on the loop's clock [ns].
     """
 
     code: str

@@ -121,8 +121,8 @@ def turned(last: LastPosition, position: Vector, config: ArmConfig) -> str:
     what lost turns look like, and hardly what a hand does.
 
     Args:
-        last: where it stood.
-        position: where it stands, as its drives say [rad or m], shape (joints,).
+        last: position of the arm when it was closed.
+        position: present position, as the drives report it [rad or m], shape (joints,).
         config: of the arm.
     """
     gears = config.transmission

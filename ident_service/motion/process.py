@@ -51,8 +51,8 @@ class TimedSink:
     """Pass samples and events on to the ring, count lateness and duration of cycles, and tell the parent the states.
 
     Attributes:
-        lateness: of waking.
-        compute: of everything between waking and the next wait.
+        lateness: histogram of the lateness of waking.
+        compute: histogram of the time between waking and the next wait.
     """
 
     def __init__(self, sink: RingSink) -> None:

@@ -21,9 +21,9 @@ class Watched:
     """Hold the summary of watching an arm, arrays of shape (joints,).
 
     Attributes:
-        joint_names: in the order of the arrays.
-        cycles: seen.
-        position: of the last answer [rad or m]; NaN where there was none.
+        joint_names: names of the joints, in the order of the arrays.
+        cycles: number of cycles watched.
+        position: position of the last answer [rad or m]; NaN where there was none.
         lowest: [rad or m].
         highest: [rad or m].
         velocity: mean over all cycles [rad/s or m/s].
@@ -107,11 +107,11 @@ def watch(
     """Watch an arm for some time, without torque, and summarise the samples.
 
     Args:
-        arm: not open.
-        seconds: how long.
-        tell: called with what the arm reports of itself and every sample.
-        cycles: how many, instead of `seconds`.
-        stop_requested: asked every cycle; True ends it with what has been seen.
+        arm: the arm, not open.
+        seconds: duration of watching [s].
+        tell: called with the arm's description and every sample.
+        cycles: number of cycles to watch, instead of `seconds`.
+        stop_requested: called every cycle; True ends watching with what has been seen.
 
     Returns:
         The summary.

@@ -48,15 +48,15 @@ class RealtimePrivileges:
     """Represent the real-time privileges that were granted, and why the others were refused.
 
     Attributes:
-        scheduling: SCHED_FIFO.
-        memory: locked, present and future.
-        core: the core that is this process' own, or None.
-        collector: frozen and switched off.
+        scheduling: whether the process has SCHED_FIFO.
+        memory: whether present and future memory is locked.
+        core: the core that is this process's own, or None.
+        collector: whether the garbage collector is frozen and switched off.
         refusals: one sentence each.
         awake: whether cores stay out of deep sleep.
         prefaulted: whether heap and stack have their pages, and keep them.
         spinning: whether its own core is kept from halting where only whoever runs this virtual machine could.
-        held: what ends with the kernel's promises when it is closed, or forgotten.
+        held: exit stack with the kernel's promises, which end when it is closed or forgotten.
     """
 
     scheduling: bool
@@ -91,8 +91,8 @@ def request_privileges(core_from_last: int = 0, settings: Realtime | None = None
     """Ask for everything; call it once, in the process of the loop, when all that it needs is loaded.
 
     Args:
-        core_from_last: which core, counted back from the last; for a second loop beside the first.
-        settings: of the arm's description, whose cores count before; defaults when None.
+        core_from_last: number of the core, counted back from the last; for a second loop beside the first.
+        settings: real-time settings of the arm's description, whose cores take precedence; defaults when None.
 
     Returns:
         What was got. It must be kept for as long as the loop runs: the core and the awake cores are lost with it.

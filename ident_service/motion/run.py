@@ -140,13 +140,14 @@ class RunReport:
     """Represent the outcome of a run.
 
     Attributes:
-        state: DONE, or STOPPED after a request to stop.
-        cycles: exchanged.
+        state: final state: DONE, or STOPPED after a request to stop.
+        cycles: number of cycles exchanged.
         peak_following_error: [rad or m], shape (joints,).
         peak_torque: largest torque sent [N m or N], shape (joints,).
-        warnings: how often each mild fault was seen.
-        finished_at: of a run that was finished early and is DONE, how much of its excitation was made [s]; else None.
-        not_finished: why a run that was to be finished early went on; empty for any other.
+        warnings: number of times that each warning was found, by code.
+        finished_at: time on the excitation at which a run was finished early [s]; None for a run that was not, or is
+            not DONE.
+        not_finished: reason why a run that was to be finished early went on; empty for any other.
         late: cycles that were late or never came.
     """
 
@@ -174,15 +175,16 @@ def run(
     """Move an open arm along an excitation and back to where it stood.
 
     Args:
-        arm: open, not enabled.
-        model: with the prior parameters that control needs.
-        excitation: checked against the limits beforehand.
-        sink: takes every sample.
-        controls: read every cycle; None for a run without stop, pause or early finish.
+        arm: the arm, open and not enabled.
+        model: model with the prior parameters that control needs.
+        excitation: motion that was checked against the limits beforehand.
+        sink: sink of every sample.
+        controls: commands, read every cycle; None for a run without stop, pause or early finish.
         speed: share of the motion's own speed at which all of it is played, approach, return and ways out of pauses
             too; a rehearsal takes 0.2. Stops are never slowed.
         latch: the arm's faults, which outlive the run; a new one when None.
-        hold_seconds: for which a stopped arm is held before the drives brake it by themselves, or it is lowered [s].
+        hold_seconds: time for which a stopped arm is held before the drives brake it by themselves, or it is lowered
+            [s].
 
     Returns:
         The report of a run that ended in DONE or, after a request, in STOPPED.
@@ -209,10 +211,10 @@ def follow(
     """Follow a plan with an open arm; `run` does this for an excitation.
 
     Args:
-        arm: open, not enabled.
-        model: with the prior parameters that control needs.
+        arm: the arm, open and not enabled.
+        model: model with the prior parameters that control needs.
         plan: the references to follow.
-        sink: takes every sample.
+        sink: sink that takes every sample.
         controls: as for `run`.
         latch: as for `run`.
         hold_seconds: as for `run`; also for the end of a plan that is held.

@@ -30,7 +30,7 @@ def fault_from_events(events: Sequence[AxisEvent], names: Sequence[str], finding
     Args:
         events: of the sample.
         names: of the joints.
-        findings: makes the faults; every warning is counted.
+        findings: counter that makes the faults and counts every warning.
 
     Returns:
         The most severe fault, the first of equals; None without events.
@@ -74,11 +74,11 @@ class Check:
     """Represent the comparison of one quantity with its threshold, for all joints.
 
     Attributes:
-        code: of the fault that a violation would be.
-        hit: where the threshold is violated, shape (joints,) or (names,).
-        what: the sentence's middle; `{}` stands for numbers, `{u}` for the position's unit, `{f}` for the torque's.
+        code: code of the fault that a violation would be.
+        hit: mask of the violations, shape (joints,) or (names,).
+        what: middle of the sentence; `{}` stands for numbers, `{u}` for the position's unit, `{f}` for the torque's.
         numbers: one array, shaped like `hit`, for each `{}`.
-        names: of what `hit` is about, the joints when None.
+        names: names of the things that `hit` is about, the joints when None.
     """
 
     code: str
@@ -94,20 +94,21 @@ class MonitoredSample:
 
     Attributes:
         sample: of this cycle.
-        wanted: where the arm should be [rad or m], shape (joints,).
-        position: last usable one of each axis [rad or m], shape (joints,).
-        velocity: filtered [rad/s or m/s], shape (joints,).
-        usable: which axes' positions may be used.
-        jumped: which have just jumped.
-        age: cycles since each was usable.
-        jumps: jumps of each in a row.
-        frozen: which encoders stand still although the joint cannot.
-        was_powered: which axes' drives have said so before, or would have by now.
-        sent: last torque asked for [N m or N], shape (joints,), or None.
+        wanted: setpoint position of the cycle [rad or m], shape (joints,).
+        position: last usable position of each axis [rad or m], shape (joints,).
+        velocity: filtered velocity [rad/s or m/s], shape (joints,).
+        usable: mask of the axes with a usable position.
+        jumped: mask of the axes whose position has just jumped.
+        age: number of cycles since each position was usable.
+        jumps: number of jumps of each position in a row.
+        frozen: mask of the encoders that stand still although the joint cannot.
+        was_powered: mask of the axes whose drives have reported before that they are energised, or would have by now.
+        sent: last torque sent [N m or N], shape (joints,), or None.
         max_age: cycles without an axis' feedback before it counts as gone.
         depths: how deep pairs of solids reach into each other [m].
-        pairs: names for them.
-        most_torque: that drives which are given positions may measure [N m or N], shape (joints,); else None.
+        pairs: names of these pairs.
+        most_torque: largest torque that drives which are given positions may measure [N m or N], shape (joints,); None
+            for drives that are given torques.
     """
 
     sample: Sample
@@ -209,7 +210,7 @@ def approach_speed(distance: Vector, limits: MotionLimits) -> Vector:
     """Return the largest speed allowed towards a position limit.
 
     Args:
-        distance: from the limit, negative beyond it [rad or m], shape (joints,).
+        distance: distance from the limit, negative beyond it [rad or m], shape (joints,).
         limits: of the arm.
 
     Returns:
@@ -223,9 +224,9 @@ def describe_check(check: Check, names: Sequence[str], units: Sequence[str]) -> 
     """Describe a violated check in words: the joints concerned, and what was measured.
 
     Args:
-        check: with at least one hit.
+        check: check with at least one hit.
         names: of the joints.
-        units: of their positions.
+        units: units of the joints' positions.
     """
     hit: list[int] = np.flatnonzero(check.hit).tolist()
     names = check.names or names
@@ -256,9 +257,9 @@ class SafetyMonitor:
     """Check every sample and every torque of one motion.
 
     Attributes:
-        findings: makes the faults and counts the warnings, of others than the guard too.
+        findings: counter that makes the faults and counts the warnings, also those of others.
         rate: largest change of torque per cycle [N m or N], shape (joints,).
-        jump: how far from the expected one a position is believed [rad or m], shape (joints,).
+        jump: largest believed distance of a position from the expected one [rad or m], shape (joints,).
     """
 
     def __init__(
@@ -279,22 +280,22 @@ class SafetyMonitor:
         """Start with the arm standing at a position.
 
         Args:
-            joint_names: for the sentences.
+            joint_names: names of the joints, for the sentences.
             limits: of the arm.
             period: of the loop [s].
-            position: where it stands [rad or m], shape (joints,).
-            revolute: which joints turn, for the units in the sentences; all when None.
+            position: present position of the arm [rad or m], shape (joints,).
+            revolute: mask of the revolute joints, for the units in the sentences; all when None.
             contact: pairs of solids that may not touch; None for no collision check.
-            encoder_observer: estimates how far joints that stand still would have moved; without it, only hard pushes
-                and full motion reveal frozen encoders.
+            encoder_observer: estimator of how far joints that stand still would have moved; without it, only hard
+                pushes and full motion reveal frozen encoders.
             max_age: cycles without an axis' feedback before it counts as gone (`ArmDescription.lost_cycles`).
-            most_torque: for drives that are given positions: the torque above which what they measure is a warning
-                [N m or N], shape (joints,); None for drives that are given torques.
+            most_torque: torque above which the measured torque of drives that are given positions is a warning [N m or
+                N], shape (joints,); None for drives that are given torques.
             coupling: drive coordinates per joint coordinates, shape (joints, joints): a drive that moves several joints
                 can stand still, too; each joint's own drive when None.
-            report_delay: of an arm that is enabled before the first sample: with which its drives say so [s]
-                (`ArmDescription.report_delay`), and as many cycles later as feedback may be missing; when None, a drive
-                may say so at any time.
+            report_delay: for an arm that is enabled before the first sample, the delay with which its drives report
+                that they are energised [s] (`ArmDescription.report_delay`); they have as many cycles more as feedback
+                may be missing. When None, a drive may report it at any time.
         """
         joints = len(position)
         self.findings = FaultCounter()
@@ -364,12 +365,12 @@ class SafetyMonitor:
 
         Args:
             sample: of this cycle.
-            reference: where the arm should be at its stamp.
+            reference: setpoint at the sample's stamp.
             velocity: filtered velocity before this sample [rad/s or m/s], shape (joints,).
-            correction: of the torque before this sample, what the errors added to it [N m or N], shape (joints,).
-            answer: the feedback acceleration in it [rad/s^2 or m/s^2], shape (joints,); without, `encoder_observer` is
-                not updated.
-            elapsed: since the sample before [s]; one period when None.
+            correction: feedback part of the torque before this sample [N m or N], shape (joints,).
+            answer: feedback acceleration in that torque [rad/s^2 or m/s^2], shape (joints,); without it,
+                `encoder_observer` is not updated.
+            elapsed: time since the sample before [s]; one period when None.
             known: whether `elapsed` is the true time; if not, it is the longest that it may be.
             feedforward: friction in the torque before this sample [N m or N], shape (joints,), which pushes a joint
                 against its own friction as the correction does.
@@ -421,7 +422,7 @@ class SafetyMonitor:
         """Check and limit a torque; the first torque is not limited in rate, because the support yields to it.
 
         Args:
-            wanted: by the controller [N m or N], shape (joints,).
+            wanted: torque demanded by the controller [N m or N], shape (joints,).
 
         Returns:
             The torque that may leave: within limits, or zero when the fault takes torque away.
@@ -466,7 +467,7 @@ class SafetyMonitor:
         """Check and limit the position that drives are given; the first is a step from where the arm stands.
 
         Args:
-            wanted: by the trajectory [rad or m], shape (joints,).
+            wanted: position demanded by the trajectory [rad or m], shape (joints,).
 
         Returns:
             The position that may leave: no farther from the last one than the joints move in a cycle at `VELOCITY_STOP`

@@ -37,18 +37,18 @@ class Paused:
     """Represent a motion that is brought to a controlled stop, and then stands.
 
     Attributes:
-        duration: until the arm stands [s].
-        time: of the motion at which it was left [s].
+        duration: time until the arm stands [s].
+        time: time on the motion at which it was left [s].
     """
 
     def __init__(self, motion: Reference, time: float, limits: MotionLimits, start: Setpoint | None = None) -> None:
         """Plan the stop out of a motion.
 
         Args:
-            motion: within the limits.
-            time: of the motion [s], at which the pause begins and is to end.
+            motion: motion within the limits.
+            time: time on the motion at which the pause begins, and the motion is to go on [s].
             limits: of the arm.
-            start: where the pause begins, if not on the motion but on a way back onto it.
+            start: setpoint at which the pause begins, if it is not on the motion but on a way back onto it.
         """
         self._motion = motion
         self._limits = limits
@@ -68,7 +68,7 @@ class Paused:
         the motion was left, but up to some tenths of a second when it must search: too long for a cycle.
 
         Args:
-            limits: of the way, by default the arm's; `slowed_limits` for one as slow as a rehearsal.
+            limits: limits of the way, by default the arm's; `slowed_limits` for one as slow as a rehearsal.
 
         Raises:
             MotionRefused: not even the motion's beginning can be reached from here.
@@ -82,7 +82,8 @@ class Paused:
 
         Args:
             limits: as for `resume`.
-            surroundings: that trajectories back must avoid; after one that does not, the search goes on.
+            surroundings: surroundings that trajectories back must avoid; after a trajectory that does not, the search
+                goes on.
 
         Raises:
             MotionRefused: as `resume`, from any of its steps.
@@ -104,9 +105,9 @@ class Paused:
         """Plan a straight trajectory at reduced speed to another setpoint at rest, to be followed after the pause.
 
         Args:
-            end: at rest.
-            limits: of the way, as for `resume`.
-            surroundings: that the trajectory must avoid.
+            end: setpoint at rest.
+            limits: limits of the way, as for `resume`.
+            surroundings: surroundings that the trajectory must avoid.
 
         Raises:
             MotionRefused: the straight way is not free; from any of the steps.
@@ -121,10 +122,10 @@ class Resumed:
     """Represent a trajectory back onto a motion, and the motion from there on.
 
     Attributes:
-        duration: of both [s].
+        duration: duration of the way back and the rest of the motion [s].
         back: length of the way back [s].
         joined: time of the motion at which the way back ends [s].
-        motion: the one it joins.
+        motion: the motion that it joins.
     """
 
     def __init__(self, back: RuckigReference, motion: Reference, joined: float) -> None:
@@ -154,12 +155,12 @@ class TrajectorySequencer:
     """Sequence the reference trajectories of a run, state by state.
 
     Attributes:
-        reference: of the last cycle.
+        reference: setpoint of the last cycle.
         first: the state of the first way.
         complete: whether the last way has been followed to its end.
-        finished_at: of a run that was finished early, how much of its excitation was made [s]; None for any other.
-        not_finished: why a run that was to be finished early goes on; empty for any other.
-        led: whether the arm was led home out of a stop: what was to be done is not done by that.
+        finished_at: time on the excitation at which a run was finished early [s]; None for any other.
+        not_finished: reason why a run that was to be finished early goes on; empty for any other.
+        led: whether the arm was led home out of a stop, by which a run is not complete.
     """
 
     def __init__(
@@ -176,13 +177,13 @@ class TrajectorySequencer:
         """Prepare to follow the given references in order.
 
         Args:
-            states: armed when the first cycle comes.
-            legs: ways and the states in which they are followed, in order; states is armed, the first comes next. Where
-                there are several, the last one leads back to `start`.
-            start: where the arm stands.
-            limits: of the arm, for stops and pauses.
-            resuming: of ways out of pauses.
-            surroundings: that trajectories out of pauses must avoid.
+            states: state machine, armed when the first cycle comes.
+            legs: states and the trajectories followed in them, in order, the first one after ARMED. Where there are
+                several, the last one leads back to `start`.
+            start: setpoint where the arm stands.
+            limits: limits of the arm, for stops and pauses.
+            resuming: limits of trajectories out of pauses.
+            surroundings: surroundings that trajectories out of pauses must avoid.
             held: whether the end of the last way is held like the end of a stop, instead of being done at once.
         """
         self.reference = start
@@ -308,7 +309,7 @@ class TrajectorySequencer:
         """Begin to search for a slow, straight trajectory home of a stopped arm; `search_return` continues.
 
         Args:
-            start: from where [rad or m], shape (joints,).
+            start: position from which the arm goes home [rad or m], shape (joints,).
         """
         limits = slowed_limits(self._limits, HOMING_SPEED)
 

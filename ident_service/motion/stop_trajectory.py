@@ -42,15 +42,15 @@ class StopProfile:
     """Represent a motion to rest, in pieces of constant jerk.
 
     Attributes:
-        duration: until the last joint stands [s].
-        end: where it stands then [rad or m], shape (..., joints).
+        duration: time until the last joint stands [s].
+        end: position at which the arm stands then [rad or m], shape (..., joints).
     """
 
     def __init__(self, start: Setpoint, pieces: Sequence[Piece]) -> None:
         """Integrate the pieces from the start on.
 
         Args:
-            start: its arrays of shape (joints,), or (samples, joints) for many ways at once.
+            start: state at the beginning, with arrays of shape (joints,), or (samples, joints) for many stops at once.
             pieces: jerk [rad/s^3 or m/s^3] and length [s] of each, shaped like the position.
         """
         knots = [start]
@@ -105,8 +105,9 @@ def stop(start: Setpoint, limits: MotionLimits) -> StopProfile:
     """Return the controlled stop from any state to rest; never raises.
 
     Args:
-        start: arrays of shape (joints,), or (samples, joints) for many stops at once. Where a number is not finite or
-            beyond 1e100, the stop is not a number either, which the guard turns into no torque.
+        start: state at the beginning, with arrays of shape (joints,), or (samples, joints) for many stops at once.
+            Where a number is not finite or beyond 1e100, the stop is not a number either, which the guard turns into no
+            torque.
         limits: acceleration and jerk are kept; position where it can be kept (see above).
     """
     with np.errstate(all="ignore"):
@@ -125,7 +126,7 @@ def stop_extent(path: Path, limits: MotionLimits) -> tuple[Vector, Vector]:
 
     Args:
         path: sampled every 5 ms in its distinct parts.
-        limits: that the stops keep.
+        limits: limits that the stops keep.
 
     Returns:
         Two arrays [rad or m], shape (joints,).

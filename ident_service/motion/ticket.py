@@ -62,11 +62,11 @@ class Measure:
 
     Attributes:
         what: name of the quantity.
-        value: None where it could not be measured or is no finite number.
+        value: measured number; None where it could not be measured or is not finite.
         unit: of the value and the limits.
         joint: name of the joint concerned, or None.
-        least: the value must not be below it, if given.
-        most: the value must not be above it, if given.
+        least: least allowed value, if any.
+        most: largest allowed value, if any.
     """
 
     what: str
@@ -99,7 +99,7 @@ class Check:
 
     Attributes:
         code: one of `CODES`.
-        verdict: how it ended.
+        verdict: outcome of the check.
         measures: the measured numbers and their limits.
         reason: failure, or why the check was not made; empty when all is well.
         remedy: one sentence that says what to do; empty when there is nothing to do.
@@ -192,13 +192,14 @@ class Subject:
 
     Attributes:
         arm: name.
-        arm_sha256: of the configuration.
+        arm_sha256: hash of the configuration.
         excitation: name of the motion; empty for none.
-        excitation_sha256: of its JSON; empty for none.
-        model_sha256: of the prior parameters.
-        identities: per axis, what the drives answered; empty where no arm could be opened.
-        bus_sha256: of joint names, rate, limits and resolutions that the open arm reports; empty likewise.
-        driver: name of the driver's software; empty likewise.
+        excitation_sha256: hash of the motion's JSON; empty for none.
+        model_sha256: hash of the prior parameters.
+        identities: answers of the drives about their identity, per axis; empty where no arm could be opened.
+        bus_sha256: hash of joint names, rate, limits and resolutions that the open arm reports; empty where none could
+            be opened.
+        driver: name of the driver's software; empty where no arm could be opened.
         software: name and version of this software.
     """
 
@@ -249,9 +250,9 @@ class Ticket:
         """Return why this ticket does not allow a motion; empty when it does.
 
         Args:
-            subject: of the motion that is to begin, with the open arm's own description. One without a motion, for the
-                path home, needs the checks of the arm and not those of the motion: that path is checked from where it
-                begins, when it begins.
+            subject: subject of the motion that is to begin, with the open arm's own description. One without a motion,
+                for the path home, needs the checks of the arm and not those of the motion: that path is checked from
+                where it begins, when it begins.
             now: UTC.
         """
         found = []
@@ -314,8 +315,8 @@ def subject_of(model: ArmModel, excitation: Excitation | None, described: ArmDes
 
     Args:
         model: of the arm.
-        excitation: to be run; None for the path home.
-        described: by the open arm, None where it could not be opened.
+        excitation: motion to be run; None for the path home.
+        described: description by the open arm; None where it could not be opened.
     """
     bus = driver = ""
     axes: tuple[str, ...] = ()

@@ -39,12 +39,12 @@ class Acceptance:
 
     Attributes:
         arm: name.
-        number: from 1; the highest is the current one.
+        number: number of the acceptance, from 1; the highest is the current one.
         run: id of the run, or the name of its folder, that the parameters stem from.
-        origin: the number whose set it is; its own, or that which was rolled back to.
-        parameters_sha256: of its `parameters.json`.
-        note: why, in the person's words.
-        at: when [s since 1970 in UTC].
+        origin: number of the acceptance whose set it is: its own, or the one that was rolled back to.
+        parameters_sha256: hash of its `parameters.json`.
+        note: reason, in the person's words.
+        at: time of the acceptance [s since 1970 in UTC].
         who: the name of the token, or `terminal:NAME`.
     """
 
@@ -64,10 +64,10 @@ def accept(db: Database, state: Path, folder: Path, note: str, who: str, *, arm:
     Args:
         db: the registry.
         state: the state folder.
-        folder: of results, verified against its manifest here.
-        note: why.
-        who: accepts; their name.
-        arm: whose they are to be; the one that the folder names if None.
+        folder: folder of the results, verified against its manifest here.
+        note: reason for the acceptance.
+        who: name of the person who accepts.
+        arm: name of the arm; the one that the folder names if None.
 
     Raises:
         UsageError: no note, no name, nothing was identified in the folder, or it is about another arm.
@@ -105,8 +105,8 @@ def rollback(db: Database, state: Path, arm: str, note: str, who: str, to: int |
         db: the registry.
         state: the state folder.
         arm: name.
-        note: why.
-        who: asks; their name.
+        note: reason for the rollback.
+        who: name of the requester.
         to: number of the acceptance; the one before the current set's if None.
 
     Raises:

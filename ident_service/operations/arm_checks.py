@@ -189,11 +189,11 @@ class ScaleCheck:
     """Scale check of one joint that was turned by hand.
 
     Attributes:
-        joint: its name.
+        joint: name of the joint.
         typed: turn that a person typed [rad or m].
         measured: turn that the drives measured, likewise.
-        good: whether they agree.
-        words: about it, for people.
+        good: whether the two agree.
+        words: result in words, for people.
     """
 
     joint: str
@@ -209,8 +209,8 @@ def check_scale(config: ArmConfig, state: Path, ask: Callable[[str], str], arm: 
     Args:
         config: of the arm; nothing is energised.
         state: the state folder.
-        ask: shows a question and returns what a person typed.
-        arm: not open; the configured one when None.
+        ask: function that shows a question and returns what a person typed.
+        arm: the arm, not open; the configured one when None.
 
     Returns:
         What was found of the joints that were turned; an empty answer leaves one out.

@@ -39,11 +39,12 @@ class MotionExtent:
         joints: names.
         units: of the joints' positions, `rad` or `m`.
         duration: of the motion [s].
-        approach: of the way from home to its beginning, and back from its end [s]; None where that cannot be planned.
-        lowest: position of each joint [rad or m], shape (joints,).
-        highest: likewise.
+        approach: duration of the way from home to its beginning, and back from its end [s]; None where that cannot be
+            planned.
+        lowest: lowest position of each joint [rad or m], shape (joints,).
+        highest: highest position of each joint [rad or m], shape (joints,).
         velocity: largest speed of each joint [rad/s or m/s], shape (joints,).
-        limits: of position, shape (joints, 2), and of velocity, shape (joints,).
+        limits: limits of position [rad or m], shape (joints, 2), and of velocity [rad/s or m/s], shape (joints,).
         tool_speed: largest speed of any joint, of any link of its file, a tool that is fixed to one too, and of any end
             of its bodies [m/s].
         reach: largest distance of any of those, with the bodies' radii, from the vertical line through the base [m].
@@ -158,7 +159,7 @@ def postures(model: ArmModel, path: FourierPath | PosturePath, time: Array, clos
     Args:
         model: of the arm.
         path: the motion.
-        time: when [s], increasing, shape (postures,).
+        time: times in the motion [s], increasing, shape (postures,).
         closest: the posture of smallest clearance, where it is known.
     """
     workspace = model.config.workspace

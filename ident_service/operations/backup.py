@@ -64,10 +64,10 @@ class Backup:
     """Backup that was made, or restored.
 
     Attributes:
-        file: where it is.
-        files: how many it holds.
-        bytes: of them.
-        created: when it was made [s since 1970 in UTC].
+        file: path of the backup.
+        files: number of files in it.
+        bytes: size of these files together [bytes].
+        created: time of the backup [s since 1970 in UTC].
         recordings: whether recordings are in it.
         replaced: folder with the old content of the state folder; None where it was empty.
     """
@@ -85,7 +85,7 @@ def back_up(state: Path, file: Path, *, recordings: bool = True) -> Backup:
 
     Args:
         state: the state folder.
-        file: appears when it is whole; readable by its owner only.
+        file: path of the backup, which appears when it is whole; readable by its owner only.
         recordings: whether those of runs are copied; if not, the copy's registry calls them deleted.
 
     Raises:
@@ -142,7 +142,7 @@ def restore(file: Path, state: Path, who: str, *, replace: bool = False) -> Back
     Args:
         file: the backup.
         state: the state folder.
-        who: does it, for the audit trail.
+        who: name of the person who restores, for the audit trail.
         replace: whether the old content is moved into a folder inside `state`; otherwise `state` must be empty.
 
     Raises:

@@ -82,9 +82,9 @@ def score(estimate: Estimate, truth: Array, plant_motion: Sequence[Truth], unsee
     """Score an estimate against the truth.
 
     Args:
-        estimate: what was identified.
+        estimate: identified estimate.
         truth: the plant's link parameters, shape (layout.size,).
-        plant_motion: of the validation run.
+        plant_motion: true motion of the plant in the validation run.
         unseen: equations of the validation recording.
     """
     true_beta = estimate.base.K @ truth
@@ -131,11 +131,11 @@ class Commissioning:
     """Result of a commissioning.
 
     Attributes:
-        folder: where everything is.
-        estimate: what was identified.
-        runs: how the two motions went.
-        score: against the truth.
-        objections: why the estimate must not be used; empty where nothing says so.
+        folder: folder of the results.
+        estimate: identified estimate.
+        runs: reports of the two motions.
+        score: score of the estimate against the truth.
+        objections: reasons why the estimate must not be used; empty where nothing says so.
         warnings: what is wrong with the recordings, in words.
     """
 
@@ -157,11 +157,11 @@ def record_motion(
     """Run one motion on an arm and record it.
 
     Args:
-        arm: not yet open.
+        arm: the arm, not yet open.
         model: of the arm.
-        motion: to run.
+        motion: motion to run.
         path: of the MCAP file; it must not exist.
-        stop_requested: asked every cycle.
+        stop_requested: called every cycle; True stops the motion.
 
     Raises:
         MotionRefused, ArmFault, DriverError: from the motion; what was recorded until then is kept.
@@ -205,12 +205,12 @@ def _counted(
     """Return `stop_requested`, which is asked every cycle, with a step told every quarter of a second of the motion.
 
     Args:
-        stop_requested: as it is.
+        stop_requested: function that is wrapped.
         rate: cycles per second.
         planned: the motion.
-        before: share of all motions that is over before this one.
-        each: share of all that one second of motion is.
-        step: told.
+        before: share of all motions that precede this one.
+        each: share of all motions that one second of motion is.
+        step: called with the progress.
     """
     cycles, every = 0, max(round(0.25 * rate), 1)
 
@@ -240,15 +240,15 @@ def simulate(
     """Commission the simulated arm of a configuration, and score the result against its true parameters.
 
     Args:
-        config: with a simulated driver.
+        config: configuration with a simulated driver.
         folder: the run folder; it appears when everything is in it, and must not exist.
-        motion: to identify from, a designed one for example; the description's when None.
+        motion: motion to identify from, a designed one for example; the description's when None.
         set_name: feasible set, the configuration's when None.
         described: the configuration as it was read, where it was changed since; `config` when None.
         custom: the function that its `constraints.custom` names.
         tell: called with a line at each step.
         step: called with what is being done and how much of all is done, from 0 to 1.
-        stop_requested: asked every cycle, and between the steps of identification.
+        stop_requested: called every cycle, and between the steps of identification; True stops.
 
     Raises:
         UsageError: the folder exists, or the arm is not simulated.

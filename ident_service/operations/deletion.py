@@ -39,7 +39,7 @@ def delete_run(db: Database, state: Path, run: str, who: str, *, anyway: bool = 
         db: the registry.
         state: the state folder.
         run: id.
-        who: deletes it.
+        who: name of the requester.
         anyway: whether to delete it although something refers to it.
 
     Returns:

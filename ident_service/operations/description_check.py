@@ -31,13 +31,13 @@ class CheckedDescription:
     """Description without mistakes.
 
     Attributes:
-        model: of its arm.
-        budget: of its buses; None for an arm without drives on CAN.
-        gains: how stable they are; None for an arm without limits or gains.
-        after_stop: what follows a stop; None where nothing may move, or for an arm without a model.
-        objections: why the arm cannot be moved, each at its place in the file; none where it can be, and where the
-            description has no driver and does not ask for it.
-        missing: limits and gains that a motion would need, by joint, of an arm without a driver.
+        model: model of the arm.
+        budget: budget of the arm's buses; None for an arm without drives on CAN.
+        gains: stability of the gains; None for an arm without limits or gains.
+        after_stop: description of what follows a stop; None where nothing may move, or for an arm without a model.
+        objections: reasons why the arm cannot be moved, each at its place in the file; none where it can be, and where
+            the description has no driver and does not ask for it.
+        missing: limits and gains, by joint, that a motion of an arm without a driver would need.
         warnings: what is allowed but probably a mistake, in words.
         falling: joints that gravity moves when their drives are off.
     """
@@ -67,7 +67,7 @@ def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescri
     """Check a description: load it, build its model, and judge bus budget, gains and stop behaviour.
 
     Args:
-        arm: its file, or its name if it is shipped.
+        arm: file of the description, or name of a shipped one.
         upload: whether somebody has sent it (`load_arm`).
 
     Raises:

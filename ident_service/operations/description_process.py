@@ -46,7 +46,7 @@ def describe_apart(path: Path, name: str) -> dict[str, Any]:
     """Write a first description of an uploaded URDF in a separate process.
 
     Args:
-        path: of the URDF, its meshes beside it.
+        path: path of the URDF, its meshes beside it.
         name: of the arm.
 
     Returns:

@@ -39,10 +39,10 @@ class PlannedDrive:
     """Hold what configuring one drive would write.
 
     Attributes:
-        drive: its number, from 1.
-        node: its node number.
-        changes: in the order in which they would be written.
-        refused: why the drive would be refused, then or before; empty where it would not.
+        drive: number of the drive, from 1.
+        node: node number of the drive.
+        changes: changes, in the order in which they would be written.
+        refused: reason why the drive would be refused, then or before; empty where it would not.
     """
 
     drive: int
@@ -58,7 +58,7 @@ def planned_configuration(
 
     Args:
         config: of the arm.
-        open_bus: gives the links, in the order of the buses.
+        open_bus: function that opens the links, in the order of the buses.
 
     Raises:
         UsageError: the arm has no CANopen drives.
@@ -95,7 +95,7 @@ def planned_zero(
 
     Args:
         config: of the arm.
-        open_bus: gives the links, in the order of the buses.
+        open_bus: function that opens the links, in the order of the buses.
 
     Raises:
         UsageError: the arm has no CANopen drives.
@@ -159,12 +159,12 @@ class ImportedDrive:
     """Hold what importing a DCF has changed, or would change, in one drive.
 
     Attributes:
-        drive: its number, from 1.
-        node: its node number.
+        drive: number of the drive, from 1.
+        node: node number of the drive.
         file: name of the DCF.
-        changes: that were written, or would be.
-        same: how many entries had their value already.
-        left: how many are left to opening, which sets them.
+        changes: changes that were written, or would be.
+        same: number of entries that had their value already.
+        left: number of entries that are left to opening, which sets them.
     """
 
     drive: int
@@ -188,9 +188,9 @@ def import_configuration(
 
     Args:
         config: of the arm.
-        files: DCFs.
+        files: the DCFs.
         dry: whether the changes are only listed.
-        open_bus: gives the links, in the order of the buses.
+        open_bus: function that opens the links, in the order of the buses.
 
     Raises:
         UsageError: no CANopen drives, not a file each, or a file that configures nothing.
@@ -282,7 +282,7 @@ def store_or_restore(
         config: of the arm.
         store: whether to store; else to restore.
         dry: whether drives are only asked whether they can.
-        open_bus: gives the links, in the order of the buses.
+        open_bus: function that opens the links, in the order of the buses.
 
     Returns:
         The node numbers of the drives.

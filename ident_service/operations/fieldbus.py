@@ -80,8 +80,8 @@ def require_budget(arm: str | Path, config: ArmConfig) -> Budget | None:
     """Return the bus budget of an arm with drives on CAN, which must fit; None for other arms.
 
     Args:
-        arm: its file, or its name if it is shipped.
-        config: what stands there.
+        arm: file of the description, or name of a shipped one.
+        config: content of the description.
 
     Raises:
         ConfigError: over budget; the mistake has the place of the driver, and the remedies.
@@ -204,11 +204,11 @@ class ScannedNode:
 
     Attributes:
         bus: number of its bus, from 0.
-        node: its number.
+        node: node number.
         drive: number of the configured drive, from 1; None for a node that is none.
         match: result of the comparison with the configuration.
-        why: what is different, in words; empty where nothing is.
-        found: its identity, state and errors; None where it is missing.
+        why: difference from the configuration, in words; empty where there is none.
+        found: identity, state and errors of the node; None where it is missing.
     """
 
     bus: int
@@ -224,7 +224,7 @@ class Scan:
     """Nodes on all buses of an arm.
 
     Attributes:
-        lines: by bus and node number.
+        lines: nodes and missing drives, by bus and node number.
         complete: whether every configured drive is there and is the configured one.
     """
 
@@ -241,7 +241,7 @@ def bus_scan(config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = op
 
     Args:
         config: the arm's.
-        open_bus: gives the links, in the order of the buses.
+        open_bus: function that opens the links, in the order of the buses.
 
     Raises:
         UsageError: the arm's driver has no bus to scan.
@@ -353,9 +353,9 @@ class Probed:
     Attributes:
         title: `drive N`, or the name of the file.
         node: number of the drive, as the description has it.
-        silent: why it was not asked, or did not answer; empty for one that did.
-        can: its capabilities; None where neither the drive nor a file tells them.
-        cut_off: why its file seems to be cut off, in words; empty where it seems to be whole.
+        silent: reason why it was not asked, or did not answer; empty for one that did.
+        can: capabilities of the drive; None where neither the drive nor a file tells them.
+        cut_off: reason why its file seems to be cut off, in words; empty where it seems to be whole.
         moves_by_position: whether it could be driven with `streams: position` where it cannot with torques.
     """
 
@@ -380,7 +380,7 @@ class Probe:
         probed: the drives in the arm's order, or the files.
         shares: whether all of them can share torque frames, as far as files and families know.
         rates: cycles per second that the buses carry at most, by kind of torque frames (`shared`, `single`).
-        status_syncs: SYNCs from one status report to the next, of drives without a timer for them.
+        status_syncs: number of SYNCs from one status report to the next, for drives without a timer for them.
         of_files: whether files were judged, and no drive was asked.
     """
 
@@ -416,7 +416,7 @@ def bus_probe(
     Args:
         config: the arm's.
         files: data sheets, judged in place of the drives without any bus.
-        open_bus: gives the links, in the order of the buses.
+        open_bus: function that opens the links, in the order of the buses.
 
     Raises:
         UsageError: the arm's driver has no bus.
@@ -713,9 +713,9 @@ def bus_report(
     Args:
         config: of the arm.
         path: of the file, which must not exist.
-        ticket: of the last preflight, left out where the file does not exist.
+        ticket: ticket of the last preflight, left out where the file does not exist.
         frames: a log of frames of a run, likewise.
-        open_bus: gives the links, in the order of the buses.
+        open_bus: function that opens the links, in the order of the buses.
 
     Returns:
         The names of the files in it.

@@ -55,22 +55,22 @@ class Request:
 
     Attributes:
         arm: description file or name of a shipped one.
-        recordings: to fit to; a path may end in `@START:END`, the seconds of that recording to read.
-        validation: to judge on; likewise.
+        recordings: recordings to fit to; a path may end in `@START:END`, the seconds of that recording to read.
+        validation: recordings to validate on; a path may end in `@START:END`, too.
         columns: a YAML file with the keys of the arm's `recording` section, instead of it.
-        columns_of: such a file for one recording each, of those above.
+        columns_of: such a file for some recordings each, of those above.
         payloads: a YAML file with the keys of a description's section `payload` for recordings with a known load.
         torque_constants: whether to identify those of the motors jointly with the parameters.
         cut_standstill: whether to leave out standstill at the ends of every recording.
         method: estimator, the arm's when None.
         set_name: feasible set, the arm's when None.
         prior: `none`, `euclidean` or `entropic`, the arm's when None.
-        prior_weight: of the prior, the arm's (or chosen on held-out data) when None.
-        delay: between position and torque [s], or `estimate`; the arm's when None.
-        replicates: of the bootstrap of the constrained estimate; 0 for none.
+        prior_weight: weight of the prior; the arm's, or one chosen on held-out data, when None.
+        delay: delay between position and torque [s], or `estimate`; the arm's when None.
+        replicates: number of replicates in the bootstrap of the constrained estimate; 0 for none.
         essential: whether to look for the smallest model that predicts as well.
         sdpa: whether to write the optimisation problems for other solvers, `constraints.custom` left out.
-        solver: of what is posed in cvxpy; Clarabel when None.
+        solver: solver of the problems that are posed in cvxpy; Clarabel when None.
         second_opinion: whether to solve the constrained problem a second time, in cvxpy.
     """
 
@@ -99,11 +99,11 @@ class IdentificationResult:
     """Result of an identification, and the files written.
 
     Attributes:
-        estimate: with everything known of it.
+        estimate: estimate with everything known of it.
         files: names of the files in the folder.
         warnings: what is wrong with the recordings, in words.
-        objections: why the estimate must not be used; empty where nothing says so.
-        torque: it was identified from (`OpenedRecordings.torque`).
+        objections: reasons why the estimate must not be used; empty where nothing says so.
+        torque: kind of torque that the arm was identified from (`OpenedRecordings.torque`).
     """
 
     estimate: Estimate
@@ -122,8 +122,8 @@ def identify_files(
     """Identify an arm from files and write the results.
 
     Args:
-        request: what is asked for.
-        folder: where results go; an earlier result there is replaced as a whole.
+        request: recordings and options.
+        folder: folder of the results; an earlier result there is replaced as a whole.
         tell: called with a line at each step that takes longer.
         step: called with what is being done and how much of all is done, from 0 to 1; shares are those of an arm of
             seven joints on a minute of data.
@@ -229,7 +229,7 @@ def custom_of(arm: str, config: ArmConfig) -> CustomFunction | None:
 
     Args:
         arm: description file or name of a shipped one.
-        config: what it says.
+        config: content of the description.
 
     Raises:
         ConfigError: it cannot be imported; with the place where the description names it.

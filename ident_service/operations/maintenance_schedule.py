@@ -82,9 +82,9 @@ class DueRule:
     """Rule for when a re-identification is due; exactly one of these.
 
     Attributes:
-        cron: five fields in UTC; None otherwise.
-        hours: of operation, since it was last due [h]; None otherwise.
-        maintenance: after each maintenance event.
+        cron: cron expression of five fields in UTC; None otherwise.
+        hours: operating hours from one due time to the next [h]; None otherwise.
+        maintenance: whether it is due after each maintenance event.
     """
 
     cron: str | None = None
@@ -98,8 +98,8 @@ def add_schedule(db: Database, arm: str, when: DueRule, by: str, now: float, mot
     Args:
         db: the registry.
         arm: name of an arm that it knows.
-        when: it is due.
-        by: who asks.
+        when: rule for when the re-identification is due.
+        by: name of the requester.
         now: s since 1970 in UTC.
         motion: id; the description's own if None.
 
@@ -185,9 +185,9 @@ def add_event(db: Database, arm: str, what: str, remark: str, by: str, now: floa
     Args:
         db: the registry.
         arm: name of an arm that it knows.
-        what: was done, in a few words.
-        remark: more of it; may be empty.
-        by: who says so.
+        what: what was done, in a few words.
+        remark: further remark; may be empty.
+        by: name of the person who reports it.
         now: s since 1970 in UTC.
 
     Raises:

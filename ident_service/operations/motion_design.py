@@ -27,7 +27,7 @@ from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.information import Information
 from ident_service.model.regressor import joint_regressor
-from ident_service.motion.clearance import touching_stop
+from ident_service.motion.clearance import motion_stop_contact
 from ident_service.operations.arm_pictures import postures
 from ident_service.operations.motion_preview import Preview, preview, preview_document, preview_text, recorded_noise
 from ident_service.operations.recordings import open_together
@@ -98,7 +98,7 @@ class PriorData:
     Attributes:
         parameters: a parameter file whose link parameters predict the torques, instead of the prior.
         noise: a parameter file of an earlier identification, whose residuals are the noise to be expected.
-        recordings: whose information the new motion adds to.
+        recordings: recordings whose information the new motion adds to.
     """
 
     parameters: Path | None = None
@@ -120,11 +120,11 @@ class DesignRequest:
     Attributes:
         arm: description file, or the name of a shipped one.
         changes: keys of the description's `design` section that shall be others.
-        knowledge: beside the description.
+        knowledge: data beside the description.
         seed: of the random starts.
         budget: of the search.
         resume: a search to go on from.
-        length: of the motion [s]; what the description's frequency and periods make of it when None.
+        length: length of the motion [s]; that of the description's frequency and periods when None.
     """
 
     arm: str
@@ -145,8 +145,8 @@ def design_files(
     """Search for a motion and write the motion, the search, and a preview.
 
     Args:
-        request: what is asked for.
-        folder: where files go; others in it stay.
+        request: description, data and options.
+        folder: folder of the files; others in it stay.
         tell: called from time to time.
         cancelled: True ends the search with what it has.
 
@@ -181,7 +181,7 @@ def design_files(
         noise=noise.deviation,
         added=added,
         earlier=earlier,
-        veto=lambda path: touching_stop(path, limits, model),
+        veto=lambda path: motion_stop_contact(path, limits, model),
         stable=lambda kp, kd: stability(model, replace(limits, kp=kp, kd=kd), delay_of(model.config)).stable,
         tell=tell,
         cancelled=cancelled,
@@ -203,7 +203,7 @@ def preview_files(arm: str, motion: Path | None, knowledge: PriorData, folder: P
         arm: description file, or the name of a shipped one.
         motion: file of the motion; the description's own identification motion when None.
         knowledge: beside the description.
-        folder: where the text and the drawings go; others in it stay.
+        folder: folder of the text and the drawings; others in it stay.
 
     Raises:
         UsageError, ConfigError: a file that does not exist or is not valid.

@@ -29,7 +29,7 @@ from ident_service.model.collision import CollisionModel, scene
 from ident_service.model.expected_friction import expected_friction
 from ident_service.model.information import information_of, sparsity
 from ident_service.model.regressor import joint_regressor
-from ident_service.motion.clearance import Nearest, stop_clearance
+from ident_service.motion.clearance import Nearest, motion_stop_clearance
 from ident_service.motion.stop_trajectory import stop_extent
 from ident_service.motion.trajectory import Setpoint, plan_reduced_trajectory, rest
 from ident_service.results.parameter_file import finite_or_none, read_parameters
@@ -47,19 +47,19 @@ class Preview:
         model: of the arm.
         excitation: the motion.
         limits: of the arm.
-        proof: verified bounds of its demands at every instant.
-        objections: every limit that is not kept, in words; empty for a motion that may run.
+        proof: verified bounds of the motion's demands at every instant.
+        objections: limits that are not kept, in words; empty for a motion that may run.
         stops: lowest and highest positions that a stop from anywhere on the motion reaches, each of shape (joints,).
-        stop_clearance: the smallest distance on stops out of the motion.
+        stop_clearance: smallest distance on stops out of the motion.
         following: following error of the simulated arm, or its forecast where the reference leaves limits and
             nothing was simulated [rad or m], shape (joints,).
-        approach: how long the way from home to its beginning takes [s], and back from its end.
-        base: the parameters.
-        noise: of the torques, as far as known.
-        deviations: to be expected, shape (base,).
+        approach: duration of the way from home to its beginning [s], and of that back from its end.
+        base: grouping of the parameters.
+        noise: noise of the torques, as far as known.
+        deviations: expected standard deviations of the base parameters [SI], shape (base,).
         negligible: sizes below which parameters are as good as zero on this motion, shape (base,).
-        condition_number: of the stacked regressor.
-        warnings: what nobody can prove or forbid, in words.
+        condition_number: condition number of the stacked regressor.
+        warnings: warnings of what nobody can prove or forbid, in words.
     """
 
     model: ArmModel
@@ -86,8 +86,8 @@ def preview(
 
     Args:
         model: of the arm, with prior parameters.
-        excitation: made for it.
-        noise: of the torques; the description's when None.
+        excitation: motion that was made for this arm.
+        noise: noise of the torques; the description's when None.
         added: information from earlier recordings, whitened by `noise`, shape (base, base).
 
     Raises:
@@ -112,7 +112,7 @@ def preview(
                 f"{name}: a stop out of the motion reaches {lowest[k]:.3f}..{highest[k]:.3f}, "
                 f"outside {limits.lower[k]:g}..{limits.upper[k]:g}"
             )
-    nearest = stop_clearance(path, limits, model)
+    nearest = motion_stop_clearance(path, limits, model)
     if nearest.distance <= 0.0:
         found.append(f"a stop out of the motion at {nearest.time:.2f} s would touch: {nearest.pair}")
     home = rest(limits.home)

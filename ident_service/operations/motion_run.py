@@ -72,7 +72,7 @@ class ProcessResult:
     """Result that the motion process reported last.
 
     Attributes:
-        report: of a run that was done or stopped, else empty.
+        report: report of a run that was done or stopped, else empty.
         error: kind, message, and code of a fault; else empty.
         code: exit code, None while it runs.
         taken: whether the process has had the arm.
@@ -140,12 +140,12 @@ def supervise_motion_process(
     """Start the motion process, keep its lease, and read its output until it ends.
 
     Args:
-        request: what it is to do (`motion/process.py`).
+        request: request to the motion process (`motion/process.py`).
         ends: file descriptors of the ring, for a sink.
         lease: how long the arm moves on when this process is gone [s].
         tell: called with each state that is entered.
-        stop_requested: asked several times per lease.
-        finish_requested: likewise; it must not wait.
+        stop_requested: called several times per lease; True stops the motion.
+        finish_requested: called several times per lease, without waiting; True finishes the motion early.
 
     Raises:
         KeyboardInterrupt: it came before the arm was taken, or the motion process did not end after it.
@@ -314,7 +314,7 @@ class TargetMonitor:
 
     Attributes:
         output: result once the target is reached, `seconds` of the motion and the largest `share`; None before.
-        period: of the motion [s], zero where it has none.
+        period: period of the motion [s], zero where it has none.
     """
 
     def __init__(self, folder: Path, target: Target, least: float, tell: Callable[[str], None]) -> None:
@@ -322,8 +322,8 @@ class TargetMonitor:
 
         Args:
             folder: of the run.
-            target: to be reached.
-            least: seconds of the motion, before which nothing counts: its period, zero where it has none.
+            target: accuracy target.
+            least: time of the motion before which nothing counts [s]: its period, zero where it has none.
             tell: called once, when the target is reached or when the process has failed.
         """
         self._request = {"folder": str(folder), "share": target.share, "parameters": target.parameters, "least": least}
@@ -381,8 +381,8 @@ class RunResult:
     """Result of a run.
 
     Attributes:
-        folder: of the run, with recording, report and manifest.
-        report: of the motion process: state, cycles, peaks, timing.
+        folder: folder of the run, with recording, report and manifest.
+        report: report of the motion process: state, cycles, peaks, timing.
     """
 
     folder: Path
@@ -410,19 +410,19 @@ def run_motion(
 
     Args:
         config: of the arm.
-        motion: made for it; or where one slow way is to lead, home for example.
+        motion: motion that was made for this arm; or the destination of one slow way, home for example.
         folder: the run folder; it must not exist.
         state: the state folder, where the arm's controls and faults are.
-        ticket: of the preflight; the motion process compares it with the open arm.
+        ticket: ticket of the preflight; the motion process compares it with the open arm.
         speed: share of the motion's own speed; motions to a destination have a fixed speed.
         lease: how long the arm moves on when this process is gone [s].
         log_frames: whether every frame of the fieldbus is kept in `can.log`, too, in candump's format.
         begin: called when all checks that do not need the arm have passed, and the folder exists.
         tell: called with each state that is entered.
         moved: called several times a second with how long the arm has been driven, in its own time [s].
-        stop_requested: asked several times a second.
-        requested_ns: when a person asked for the motion, on the machine's monotonic clock [ns]; now when None. A stop
-            that was asked for since then keeps it from beginning.
+        stop_requested: called several times a second; True stops the motion.
+        requested_ns: time when a person asked for the motion, on the machine's monotonic clock [ns]; now when None. A
+            stop that was asked for since then keeps it from beginning.
         until: accuracy target at which the run is finished early; None for one that goes on to its end.
 
     Raises:

@@ -17,7 +17,7 @@ def stop_arms(state: Path, arm: str | None) -> list[str]:
 
     Args:
         state: the state folder.
-        arm: its name; None for all that ever moved.
+        arm: name of the arm; None for all that ever moved.
     """
     return _reach(state, arm, ControlFile.stop_motions)
 
@@ -30,8 +30,8 @@ def ask_process(path: Path, asked: Asked) -> int:
 
     Args:
         path: of the control file.
-        asked: pause, or go on; end a run early by its regular end, out of a pause too; or release an arm that is held
-            after a stop, since a person sees it supported.
+        asked: request: pause, or go on; finish a run early by its regular end, out of a pause too; or release an arm
+            that is held after a stop, since a person sees it supported.
 
     Raises:
         UsageError: no process holds it.

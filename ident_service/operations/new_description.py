@@ -60,21 +60,21 @@ class Draft:
         name: of the arm.
         source: name of the file that it is made from.
         part: the keys of its kinematics.
-        gravity: in the base frame [m/s^2].
-        gravity_origin: in words, where gravity is from.
+        gravity: gravity in the base frame [m/s^2].
+        gravity_origin: origin of that gravity, in words.
         joints: keys of each joint.
-        origins: of each joint's keys, where their values come from.
+        origins: origins of the values of each joint's keys.
         geometry: capsules of links whose meshes are replaced.
         may_touch: pairs that always touch.
         prior: names and values where the file's bodies are not those of real links; empty where they are.
         use: share of the limits that the motions take.
-        seeds: of the two motions.
-        frequency: of the two motions [Hz].
-        cutoff: of the velocity's low-pass [Hz], of each joint.
+        seeds: seeds of the two motions.
+        frequency: frequency of the two motions [Hz].
+        cutoff: cut-off of the velocity's low-pass of each joint [Hz].
         encoder: resolution of the simulated arm's encoders [rad or m], of each joint.
         standstill: speed below which a joint counts as standing [rad/s or m/s]; 0 for what is usual.
-        total_mass: largest of the arm [kg].
-        truth: of the simulated arm.
+        total_mass: largest total mass of the arm [kg].
+        truth: true parameters of the simulated arm.
         remarks: what was guessed, for people.
     """
 
@@ -118,8 +118,8 @@ def in_yaml(draft: Draft, revolute: Mapping[str, bool] | None = None) -> str:
     """Return the description as YAML with comments.
 
     Args:
-        draft: what it says.
-        revolute: of each joint by name, whether it turns; all do when None.
+        draft: content of the description.
+        revolute: whether each joint is revolute, by name; all are when None.
     """
     guessed = "\n".join(f"#   {line}" for line in draft.remarks)
     parts = [
@@ -262,12 +262,12 @@ def new_description(
 
     Args:
         source: a URDF, an MJCF, or a DH table as CSV or YAML.
-        out: where the description goes; `NAME.yaml` in the present folder when None.
-        name: of the arm; that of the file when None.
+        out: path of the new description; `NAME.yaml` in the present folder when None.
+        name: name of the arm; that of the file when None.
         base: link that the arm stands on; found when None.
         tip: link that it ends at; before the gripper of the longest branch when None.
         tell: called with a line at each step.
-        convention: of a DH table that does not say it, `standard` or `modified`.
+        convention: convention of a DH table that does not name its own, `standard` or `modified`.
 
     Returns:
         The description's path, and what was guessed.

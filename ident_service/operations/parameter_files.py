@@ -90,7 +90,7 @@ def check_file(
         kind: feasible set; the file's own when None, or else `pseudo_inertia`.
         arm: a description whose physical constraints are added; without one, drive inertia, viscous and Coulomb
             friction are positive.
-        notation: of the file's names, where it is not ours.
+        notation: notation of the file's names, where it is not ours.
 
     Raises:
         UsageError, ConfigError, ParameterError: the file or the arm cannot be used.
@@ -115,12 +115,12 @@ def correct_file(
 
     Args:
         path: the file.
-        out: where the corrected one goes.
+        out: path of the corrected file.
         kind: feasible set; the file's own when None, or else `pseudo_inertia`.
         arm: a description whose physical constraints are added, as for `check_file`.
-        metric: what nearest means: the paper's, in the units of the parameters, or that of the file's covariance, which
-            does not depend on the choice of base columns.
-        notation: of the file's names, where it is not ours; the corrected file has ours.
+        metric: metric of the distance: the paper's, in the units of the parameters, or that of the file's covariance,
+            which does not depend on the choice of base columns.
+        notation: notation of the file's names, where it is not ours; the corrected file has ours.
 
     Raises:
         UsageError, ConfigError, ParameterError: the file or the arm cannot be used, or `out` not written.
@@ -236,7 +236,7 @@ def compare_into(reference: Path, folder: Path) -> Comparison:
 
     Args:
         reference: folder of results or parameter file.
-        folder: of results, verified here.
+        folder: folder of the results, verified here.
 
     Raises:
         UsageError, ParameterError, ConfigError: as `compare_files`.
@@ -263,10 +263,10 @@ class PayloadResult:
     """Result of a payload identification, and the files written.
 
     Attributes:
-        arm: as it was identified.
-        payload: what it carries.
+        arm: the arm as it was identified.
+        payload: payload of the arm.
         document: the content of `payload.json`.
-        text: for a person.
+        text: text for a person.
         comparison: the arm against the arm with its load; None where there is no body.
         files: names of the files in the folder.
     """
@@ -284,8 +284,8 @@ def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_off
 
     Args:
         run: folder of results of the arm.
-        recordings: with the load; a path may end in `@START:END`, the seconds to read.
-        out: where results go; an earlier result there is replaced as a whole.
+        recordings: recordings with the load; a path may end in `@START:END`, the seconds to read.
+        out: folder of the results; an earlier result there is replaced as a whole.
         refit_offsets: whether torque offsets may differ from those of the arm.
 
     Raises:

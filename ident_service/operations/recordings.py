@@ -55,9 +55,10 @@ class OpenedRecordings:
     """Recordings that are read for one estimate.
 
     Attributes:
-        recordings: in the order in which they were named.
-        torque: that they give: `measured` by the drives, `commanded`, `recorded` by other programs, or those in a row.
-        remarks: what was left out to have one torque in all of them.
+        recordings: recordings, in the order in which they were named.
+        torque: kind of torque in them: `measured` by the drives, `commanded`, `recorded` by other programs, or several
+            of these.
+        remarks: remarks on torques that were left out to have one kind in all recordings.
     """
 
     recordings: tuple[Recording, ...]
@@ -78,10 +79,10 @@ def open_together(
     own delay. So measured ones are used where all recordings have them, and commanded ones otherwise.
 
     Args:
-        paths: as for `open_for_arm`.
+        paths: paths of the recordings, as for `open_for_arm`.
         model: the arm, whose `identification.torque` may demand one of them.
         forms: how each file is laid out, where not as the description says.
-        torque: that must be used, in place of the description's.
+        torque: kind of torque that must be used, in place of the description's.
         payloads: known load of each recording that has one, beside that of the description.
 
     Raises:
@@ -135,7 +136,7 @@ def open_for_arm(
         model: the arm.
         form: how this file is laid out, and what to trim; as the arm's description says when None. Its `trim` counts
             where it is not the description's, which whatever reads the recording leaves out.
-        torque: that is to be read, in place of the description's.
+        torque: kind of torque to read, in place of the description's.
         payload: known load that the arm carried, beside that of the description.
 
     Raises:
@@ -222,7 +223,7 @@ def known_payloads(files: Mapping[Path, Path], recordings: Sequence[Path], model
     """Read the files of known payloads.
 
     Args:
-        files: of each recording that has one: YAML with the keys of a description's section `payload`.
+        files: file of each recording that has one: YAML with the keys of a description's section `payload`.
         recordings: all that are read, as they were named.
         model: the arm.
 
@@ -254,8 +255,8 @@ def require_no_fault(path: Path, recording: Recording) -> None:
     """Refuse a recording made by ident in which a fault stopped the arm, unless its range ends before.
 
     Args:
-        path: as it was named.
-        recording: what was opened for it.
+        path: path of the recording as it was named.
+        recording: the opened recording.
 
     Raises:
         RecordingError: names the fault and when it was.

@@ -46,15 +46,15 @@ class Recovery:
 
     Attributes:
         arm: name.
-        faults: that nobody has acknowledged, the earliest first.
+        faults: unacknowledged faults, the earliest first.
         moved_by: process that moves the arm, or None.
-        seen: at the arm, after a reset if there was one; None where it could not be looked at.
-        unreachable: why not, or empty.
-        zero_lost: why the arm does not know where it stands, or empty; nothing else is then seen of it.
+        seen: what was seen at the arm, after a reset if there was one; None where it could not be read.
+        unreachable: reason why it could not be read, or empty.
+        zero_lost: reason why the arm does not know its position, or empty; nothing else is then seen of it.
         reset: axes whose drives were reset just now.
-        tripped: what drives still have latched, by axis.
+        tripped: faults that drives still have latched, by axis.
         outside: joints outside their position limits, in words.
-        steps: what to do next, one sentence each, in order; the last one is what a usable arm needs as well.
+        steps: next steps, one sentence each, in order; the last one is what a usable arm needs as well.
         usable: whether `ident preflight` can be run.
     """
 
@@ -77,7 +77,7 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str 
     Args:
         config: of the arm.
         state: the state folder.
-        arm: not open; the configured one when None.
+        arm: the arm, not open; the configured one when None.
         called: the arm as commands are to name it, its file for example; its name when None.
 
     Raises:
@@ -247,9 +247,9 @@ class ZeroingResult:
 
     Attributes:
         arm: name.
-        posture: that the arm stands in, of all joints.
+        posture: posture of the arm, of all joints.
         drives: message of each drive about its zero.
-        faults: that nobody has acknowledged; zeroing is possible with them and leaves them as they are.
+        faults: unacknowledged faults; zeroing is possible with them and leaves them as they are.
         ticket_removed: whether there was a preflight ticket, which was about another zero.
     """
 
@@ -287,8 +287,8 @@ def set_home(config: ArmConfig, state: Path, confirm: Callable[[str], str], arm:
     Args:
         config: of the arm.
         state: the state folder.
-        confirm: asks a person, who has seen the posture, for the arm's name.
-        arm: not open; the configured one when None.
+        confirm: function that asks a person, who has seen the posture, for the arm's name.
+        arm: the arm, not open; the configured one when None.
 
     Raises:
         UsageError: as `home_posture`.

@@ -31,8 +31,8 @@ def import_run(db: Database, state: Path, folder: Path, who: str) -> Row:
     Args:
         db: the registry.
         state: the state folder.
-        folder: with a manifest; files that it does not name are left behind.
-        who: asks.
+        folder: folder with a manifest; files that it does not name are left behind.
+        who: name of the requester.
 
     Returns:
         The run; one that is there already, with the same manifest, is only entered again.
@@ -85,7 +85,7 @@ class PrunableRecording:
     Attributes:
         run: id.
         name: of the file.
-        bytes: its size.
+        bytes: size of the file [bytes].
     """
 
     run: str

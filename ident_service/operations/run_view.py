@@ -59,9 +59,9 @@ class Viewed:
     """Describe what is shown of a run.
 
     Attributes:
-        recordings: their names, in order.
-        residuals: names of those with residuals.
-        saved: the file, None where a viewer was opened.
+        recordings: names of the recordings, in order.
+        residuals: names of the recordings with residuals.
+        saved: the written file, None where a viewer was opened.
     """
 
     recordings: tuple[str, ...]
@@ -82,10 +82,10 @@ def view_run(
     """Show a run in Rerun's viewer, or write what it would show into a file.
 
     Args:
-        folder: of `ident run`, `simulate` or `identify`.
-        recordings: besides those in the folder; results of `identify` have none of their own.
+        folder: folder made by `ident run`, `simulate` or `identify`.
+        recordings: recordings besides those in the folder; results of `identify` have none of their own.
         save: file that must not exist; None opens the viewer.
-        urdf: with meshes to draw instead of capsules.
+        urdf: URDF with meshes to draw instead of capsules.
 
     Raises:
         UsageError: Rerun is not installed, there is no display, the file exists, the folder has no arm or recordings,

@@ -42,8 +42,8 @@ def watch(folder: Path, target: Target, least: float) -> dict[str, Any] | None:
 
     Args:
         folder: of the run.
-        target: to be reached.
-        least: seconds of the motion itself, before which nothing counts: its period, zero where it has none.
+        target: accuracy target.
+        least: time of the motion before which nothing counts [s]: its period, zero where it has none.
 
     Raises:
         IdentError: the recording or the description cannot be read.
@@ -73,8 +73,8 @@ def missed(folder: Path, target: Target, period: float) -> list[dict[str, Any]]:
     """Return which of the chosen parameters the whole recording of a run does not determine as well as asked.
 
     Args:
-        folder: of the run, which is over.
-        target: that was not reached on the way.
+        folder: folder of the run, which is over.
+        target: accuracy target that was not reached on the way.
         period: of the motion [s]; zero where it has none.
 
     Returns:

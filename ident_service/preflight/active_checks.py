@@ -73,8 +73,8 @@ class TestMotion:
     """Represent a small test motion of one joint from where it stands and back.
 
     Attributes:
-        joint: index.
-        amplitude: signed [rad or m].
+        joint: index of the joint.
+        amplitude: signed amplitude [rad or m].
         duration: [s].
     """
 
@@ -101,8 +101,8 @@ class JointResponse:
     """Represent the response of one joint to its test motion.
 
     Attributes:
-        follows: measured over commanded displacement; NaN where the joint was not moved.
-        answers: measured over expected acceleration; NaN likewise.
+        follows: ratio of the measured to the commanded displacement; NaN where the joint was not moved.
+        answers: ratio of the measured to the expected acceleration; NaN where the joint was not moved.
         doubt: standard deviation of `answers`.
     """
 
@@ -398,7 +398,7 @@ def _fitted(columns: Vector, values: Vector, correlated: float) -> tuple[float, 
     Args:
         columns: shape (samples, unknowns).
         values: shape (samples,).
-        correlated: over how many samples residuals are not independent.
+        correlated: number of samples over which residuals are not independent.
     """
     size = np.linalg.norm(columns, axis=0)
     size = np.where(size > 0.0, size, 1.0)
@@ -451,7 +451,7 @@ def holding_torque(rows: Rows, period: float) -> Vector:
     """Return the mean torque that held the arm, after it had settled [N m or N], shape (joints,).
 
     Args:
-        rows: of holding still for `SETTLE + HOLD` seconds.
+        rows: cycles of holding still for `SETTLE + HOLD` seconds.
         period: [s].
     """
     return np.asarray(np.mean([sample.torque for sample, _ in rows[round(SETTLE / period) :]], axis=0))
@@ -499,10 +499,10 @@ def holding_fault_check(
     although the torque that holds it is above the model's. Its joints stick on the way, like a frozen encoder.
 
     Args:
-        session: in which it was held.
+        session: session that held the arm.
         model: of the arm.
         limits: of the arm.
-        friction: expected.
+        friction: expected friction.
         error: the fault.
     """
     remedy, trace = remedy_of(error), session.trace()

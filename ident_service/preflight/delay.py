@@ -60,9 +60,9 @@ def hidden_delay(trace: Trace, expected: Vector, joint: int) -> Delay | None:
     `a = g b - g d db/dt + f_c sign(v) + f_v v + c` to first order.
 
     Args:
-        trace: of a test motion with the sinusoidal torque; nothing is measured in a loop too slow for it.
+        trace: trace of a test motion with the sinusoidal torque; nothing is measured in a loop too slow for it.
         expected: positions that the model expects of the torque that acted [rad or m], shape (cycles, joints).
-        joint: that was moved, by number.
+        joint: index of the joint that was moved.
     """
     period, rate = trace.period, trace.rate[:, joint]
     if FREQUENCY * period > 1.0 / _LEAST_SAMPLES:

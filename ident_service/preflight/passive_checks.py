@@ -50,7 +50,7 @@ class IdleRecording:
     """Hold cycles recorded without torque.
 
     Attributes:
-        samples: in the order of cycles.
+        samples: samples, in the order of the cycles.
         woken_ns: time of the loop's clock when each exchange returned [ns], shape (cycles,).
         period: of the description [s].
     """
@@ -82,9 +82,9 @@ def record_idle(
 
     Args:
         arm: open.
-        cycles: how many.
+        cycles: number of cycles.
         period: of its description [s].
-        work: done in every cycle, so that the rate is measured under the load of a run.
+        work: function that is called in every cycle, so that the rate is measured under the load of a run.
 
     Raises:
         DriverError: the arm does not answer at all.
@@ -108,11 +108,12 @@ def identities_check(
     """Check that every axis answers, and is the drive that the description means.
 
     Args:
-        described: by the open arm.
+        described: description by the open arm.
         model: of the arm.
-        limits: of the description; the driver must not clip below them, or what was proven of torques is not true.
-        looked: at the arm.
-        setup: what the drives report of their set-up.
+        limits: limits of the description; the driver must not clip below them, or what was proven of torques is not
+            true.
+        looked: idle recording of the arm.
+        setup: reports of the drives on their set-up.
     """
     code, names = "identities", model.chain.names
     if described.joint_names != names:
@@ -172,10 +173,10 @@ def at_rest_check(
     """Check that the arm stands still without torque, inside its limits, and no motor whole turns elsewhere.
 
     Args:
-        looked: at the arm.
+        looked: idle recording of the arm.
         model: of the arm.
         limits: of the arm.
-        closed: where it stood when it was closed last, where that is known.
+        closed: last position before the arm was closed, where that is known.
     """
     code, names = "at_rest", model.chain.names
     if not looked.usable:
@@ -253,10 +254,10 @@ def noise_check(
     """Check the position noise of an arm at rest, and what filter and gains make of it.
 
     Args:
-        looked: at the arm, at rest.
-        described: for the encoders' steps.
-        model: for the control section.
-        limits: for the gains.
+        looked: idle recording of the arm at rest.
+        described: description by the open arm, with the encoders' steps.
+        model: model with the section `control` of the description.
+        limits: limits with the gains.
         mass: the model's mass matrix where the arm stands, shape (joints, joints).
     """
     if not looked.usable:

@@ -123,17 +123,18 @@ def preflight(
     """Check an arm and a motion.
 
     Args:
-        arm: not open; it stands on its support, without torque.
+        arm: the arm, not open; it stands on its support, without torque.
         model: of the arm.
-        excitation: to be run; None for the path home or out of a limit, which may begin a little outside the
+        excitation: motion to be run; None for the path home or out of a limit, which may begin a little outside the
             position limits.
-        confirm: shows a question and returns what a person typed; asked once, before anything is energised.
-        clock: whose UTC the ticket is stamped with; by default the machine's. The loop has the arm's own.
+        confirm: function that shows a question and returns what a person typed; called once, before anything is
+            energised.
+        clock: clock whose UTC stamps the ticket; by default the machine's. The loop has the arm's own.
         tell: called with every check as soon as it is made.
         valid: how long the ticket counts.
         look_seconds: how long rate and noise are measured.
         rate_seconds: how long the rate is measured with the torque that holds the arm, at least for `HOLD`.
-        closed: where the arm stood when it was closed last, where that is known.
+        closed: last position before the arm was closed, where that is known.
         announce: called with what a person has to do before the arm can be enabled, and is waited for.
 
     Returns:

@@ -111,7 +111,7 @@ def remedy_of(fault: ArmFault) -> str | None:
     """Return one sentence that says what to do about a fault.
 
     Args:
-        fault: that ended the loop.
+        fault: fault that ended the loop.
 
     Returns:
         None where the fault does not say what failed: the arm is not where it should be, too fast, or told too much.
@@ -146,8 +146,8 @@ class Trace:
     it, and the torque before it acted on.
 
     Attributes:
-        position: measured [rad or m], shape (cycles, joints).
-        torque: that acts from each stamp on [N m or N], shape (cycles, joints).
+        position: measured position [rad or m], shape (cycles, joints).
+        torque: torque that acts from each stamp on [N m or N], shape (cycles, joints).
         reference: position asked for [rad or m], shape (cycles, joints).
         rate: velocity asked for [rad/s or m/s], shape (cycles, joints).
         period: [s].
@@ -164,7 +164,7 @@ def trace_of(rows: Rows, period: float) -> Trace:
     """Return cycles with their references, the earliest first, as a trace.
 
     Args:
-        rows: at least one; stamps rise.
+        rows: cycles, at least one, whose stamps rise.
         period: [s].
     """
     stamps = np.array([sample.stamp_ns for sample, _ in rows])
@@ -187,14 +187,14 @@ class Session:
     """Run a guarded loop on an open arm at rest.
 
     Attributes:
-        home: where the arm stood [rad or m], shape (joints,).
-        gravity: the model's torque there [N m or N], shape (joints,).
-        mass: the model's mass matrix there, shape (joints, joints).
-        inertia: the same with the drive inertia that the description knows of and the prior lacks.
+        home: position in which the arm stood [rad or m], shape (joints,).
+        gravity: model's torque in that position [N m or N], shape (joints,).
+        mass: model's mass matrix in that position, shape (joints, joints).
+        inertia: mass matrix with the drive inertia that the description knows of and the prior lacks.
         lightest: the least inertia that each joint may have [kg m^2 or kg], shape (joints,): links lighter than
             modelled, and all of the described drive inertia.
         period: [s].
-        torque_limit: of the description [N m or N], shape (joints,).
+        torque_limit: torque limits of the description [N m or N], shape (joints,).
         gives_positions: whether the drives are given positions.
     """
 
@@ -211,11 +211,11 @@ class Session:
 
         Args:
             arm: open, at rest, not enabled.
-            model: with a prior.
+            model: model with a prior.
             limits: of the arm.
             described: description of the open arm.
-            home: where it stands [rad or m], shape (joints,).
-            friction: widens the band of torques.
+            home: position in which the arm stands [rad or m], shape (joints,).
+            friction: expected friction, which widens the band of torques.
         """
         period = 1.0 / described.rate
         known = control_model(model).prior
@@ -289,8 +289,8 @@ class Session:
         """Follow a reference for some time.
 
         Args:
-            reference: from here on.
-            seconds: how long.
+            reference: trajectory from the present setpoint on.
+            seconds: duration [s].
             learning: how fast the torque that dry friction takes is learned from the lag of moving joints, as a share
                 of `kp M` times that lag per second [1/s]. Without, small motions get lost in friction: what moves a
                 WAM's first joint takes 13 mrad of error.
@@ -356,8 +356,8 @@ class Session:
 
         Args:
             sample: of this cycle.
-            setpoint: for the joints that are held.
-            given_up: which joints no longer are, shape (joints,).
+            setpoint: setpoint of the joints that are held.
+            given_up: mask of the joints that are held no more, shape (joints,).
             sends: whether targets are sent; where they are what drives miss, the last one stays the last one.
 
         Raises:

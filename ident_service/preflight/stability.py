@@ -48,8 +48,8 @@ class Loop:
         kp: position gains [1/s^2], shape (joints,).
         kd: velocity gains [1/s], shape (joints,).
         period: [s].
-        cutoff: of the velocity low-pass [Hz], one or shape (joints,).
-        delay: from a sample to the torque computed from it [cycles], at least 1, whole or not.
+        cutoff: cut-off of the velocity low-pass [Hz], one or shape (joints,).
+        delay: delay from a sample to the torque computed from it [cycles], at least 1, whole or not.
     """
 
     kp: Vector
@@ -70,12 +70,12 @@ class JointStability:
     """Represent the stability of one joint's loop by itself.
 
     Attributes:
-        joint: its name.
+        joint: name of the joint.
         lightest: the least true inertia considered, as a share of the model's.
         radius: the largest spectral radius over the range of inertias.
         gain_margin: the loop gain may rise by this factor at the model's inertia before it oscillates; 1000 stands for
             more, and 1 for none.
-        delay_margin: so much may be added to the delay at the model's inertia [s]; 0 for none.
+        delay_margin: delay that may be added at the model's inertia before the loop oscillates [s]; 0 for none.
     """
 
     joint: str
@@ -91,8 +91,8 @@ class StabilityReport:
 
     Attributes:
         period: of the loop [s].
-        delay_cycles: assumed.
-        joints: each by itself.
+        delay_cycles: assumed delay from a sample to the torque computed from it [cycles].
+        joints: stability of each joint by itself.
         coupled_radius: the largest spectral radius of all joints together over postures and inertias; None where no
             model is known.
     """
@@ -136,11 +136,11 @@ def stability(
     """Compute the stability of an arm's gains at some postures and over the range of inertias.
 
     Args:
-        model: without a prior, only each joint by itself is judged.
-        limits: for the gains, and for postures where none are given.
-        delay_cycles: from a sample to the torque computed from it; 1 is the Arm contract's.
-        postures: to judge the coupled loop at [rad or m], shape (samples, joints), of a motion for example; by default
-            home, the middle of the position limits and a few random ones.
+        model: model; without a prior, only each joint by itself is judged.
+        limits: limits with the gains, and the position limits for postures where none are given.
+        delay_cycles: delay from a sample to the torque computed from it [cycles]; 1 is the Arm contract's.
+        postures: postures in which the coupled loop is judged [rad or m], shape (samples, joints), of a motion for
+            example; by default home, the middle of the position limits and a few random ones.
 
     Raises:
         UsageError: a delay below one cycle.
@@ -176,7 +176,7 @@ def transition(loop: Loop, ratio: Vector) -> Vector:
     """Return the matrix of the linear recursion.
 
     Args:
-        loop: gains, rate and delay.
+        loop: loop with gains, rate and delay.
         ratio: `R = M_true^-1 M_model`, shape (..., joints, joints).
 
     Returns:

@@ -14,7 +14,7 @@ from ident_service.model.collision import CollisionModel
 from ident_service.model.kinematics import frame_origins
 from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.motion.after_stop import after_stop, falling_joints
-from ident_service.motion.clearance import stop_clearance, trajectory_clearance
+from ident_service.motion.clearance import motion_stop_clearance, trajectory_clearance
 from ident_service.motion.run import unhurried
 from ident_service.motion.run_plan import Destination, PointToPointPlan
 from ident_service.motion.stop_trajectory import require_stops_within_limits
@@ -53,7 +53,7 @@ def configuration_check(model: ArmModel, load: Budget | None = None) -> Check:
 
     Args:
         model: of the arm.
-        load: of its buses; None for an arm on none.
+        load: load of the arm's buses; None for an arm on none.
     """
     code, remedy = "configuration", "Complete the arm's description; `ident config check` names every place."
     try:
@@ -82,9 +82,9 @@ def long_silence(model: ArmModel, limits: MotionLimits, seconds: float | None) -
     """Describe in words that joints can fall while drives go on without their host; empty where they do not for long.
 
     Args:
-        model: of the arm, with a prior.
+        model: model of the arm, with a prior.
         limits: of the arm.
-        seconds: after which the drives give up torque [s]; None where unknown.
+        seconds: time after which the drives give up torque [s]; None where unknown.
     """
     if seconds is None or seconds <= LONGEST_SILENCE or model.config.watchdog_reason:
         return ""
@@ -115,7 +115,7 @@ def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excit
     try:
         proof = proof_of(excitation.path, model, limits, CollisionModel(model))
         found = violations(proof, model, limits)
-        nearest = stop_clearance(excitation.path, limits, model)
+        nearest = motion_stop_clearance(excitation.path, limits, model)
     except (ModelError, MotionRefused) as error:
         return failed(code, str(error), remedy)
     try:
@@ -206,8 +206,8 @@ def distance_from_home_text(model: ArmModel, limits: MotionLimits, position: Vec
 
     Args:
         model: of the arm.
-        limits: of the arm, with its home.
-        position: where it stands [rad or m], shape (joints,).
+        limits: limits of the arm, with its home.
+        position: present position of the arm [rad or m], shape (joints,).
     """
     units = joint_units(model.chain.revolute, "rad", "m")
     far = np.abs(position - limits.home)
@@ -236,7 +236,7 @@ def paths_check(model: ArmModel, limits: MotionLimits, excitation: Excitation, p
         model: of the arm.
         limits: of the arm.
         excitation: the motion.
-        position: where the arm stands [rad or m], shape (joints,).
+        position: present position of the arm [rad or m], shape (joints,).
     """
     code = "ways_clear"
     motion = PathReference(excitation.path)

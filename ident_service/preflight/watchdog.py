@@ -51,7 +51,7 @@ class Consent:
     """Represent whether the drives' watchdog may be tried.
 
     Attributes:
-        given: it may.
+        given: whether it may be tried.
         check: the check to report where it may not, else None.
     """
 
@@ -63,9 +63,9 @@ def confirm_watchdog_test(model: ArmModel, sample: Sample, confirm: Confirm) -> 
     """Ask a person whether the drives' watchdog may be tried, before anything is energised.
 
     Args:
-        model: of the arm; its name must be typed.
-        sample: of the arm without torque; without status words the drives' reaction cannot be seen.
-        confirm: shows a question and returns what the person typed.
+        model: model of the arm, whose name must be typed.
+        sample: sample of the arm without torque; without status words the drives' reaction cannot be seen.
+        confirm: function that shows a question and returns what the person typed.
     """
     if not sample.status:
         why = "the driver does not report drive states, so the watchdogs cannot be tested"
@@ -101,10 +101,10 @@ def watchdog_check(
     not given up yet; only where SYNC is withheld, and no position comes, the last torque goes on.
 
     Args:
-        arm: enabled, held by `session`.
-        model: for names.
+        arm: the arm, enabled and held by `session`.
+        model: model with the joints' names.
         session: the loop that holds the arm; without torque frames the last torque acts until a drive ends it.
-        setpoint_at: where the joints that are held should be, by the time since the silence began [s].
+        setpoint_at: function from the time since the silence began [s] to the setpoint of the joints that are held.
         moving: number of the joint that moves, whose travel is measured; None at standstill.
 
     Raises:

@@ -30,13 +30,14 @@ class RangeRecording:
     """Select the samples of another recording within a range of its time, behind the same protocol.
 
     Attributes:
-        path: of the other recording; its last part ends in the range where that was asked for by name.
-        sha256: of the whole file.
-        start: of the range, included [s] after the file's first sample.
-        end: of the range, excluded [s] after the file's first sample.
+        path: path of the other recording; its last part ends in the range where that was asked for by name.
+        sha256: hash of the whole file.
+        start: start of the range, included [s after the file's first sample].
+        end: end of the range, excluded [s after the file's first sample].
         whole: the file.
-        ended: when the motion ended early and the rest was left out [s after the file's first sample]; None if not.
-        standstill: seconds that were left out as standstill at the start and at the end [s].
+        ended: time at which the motion ended early, after which the rest was left out [s after the file's first
+            sample]; None if it did not.
+        standstill: times that were left out as standstill at the start and at the end [s].
     """
 
     def __init__(self, whole: Recording, start: float, end: float, label: str = "") -> None:
@@ -44,8 +45,8 @@ class RangeRecording:
 
         Args:
             whole: a file, or a range of one.
-            start: [s] after the first sample of the file.
-            end: likewise; may be infinite.
+            start: start of the range [s after the file's first sample].
+            end: end of the range [s after the file's first sample]; may be infinite.
             label: suffix of the name, to tell ranges of one file apart; a range that was asked for by name may not
                 end more than a second after its file.
         """
@@ -53,7 +54,7 @@ class RangeRecording:
         self.sha256 = whole.sha256
         self.joint_names = whole.joint_names
         self.joints = whole.joints
-        self.torque_held = whole.torque_held
+        self.torque_zero_order_hold = whole.torque_zero_order_hold
         self.torn = whole.torn
         before, after = time_range(whole)
         self.start, self.end = max(start, before), min(end, after)
@@ -136,8 +137,8 @@ def without_standstill(recording: Recording, margin: float) -> RangeRecording:
     A joint moves where its mean position over 0.1 s changes by more than 0.005 rad/s or m/s to the next 0.1 s.
 
     Args:
-        recording: to be read through once.
-        margin: of standstill that is kept at both ends [s].
+        recording: recording that is read through once.
+        margin: standstill that is kept at both ends [s].
 
     Raises:
         RecordingError: no joint moves; and whatever reading the blocks raises.
@@ -177,7 +178,7 @@ def without_ends(recording: Recording, trim: tuple[float, float]) -> RangeRecord
     """Return the recording without its first and last seconds, as `resampling.trimmed` does.
 
     Args:
-        recording: to be read through once.
+        recording: recording that is read through once.
         trim: seconds to leave out at the start and at the end [s].
 
     Raises:
@@ -209,7 +210,7 @@ class JointSideRecording:
 
         Args:
             motors: one column a motor, position [rad] and torque [N m] at the motor.
-            transmission: from the motors to the joints.
+            transmission: transmission from the motors to the joints.
             positions: whether positions and velocities are the motors'; the joints' otherwise.
             torques: whether torques are the motors'; the joints' otherwise.
 
@@ -224,7 +225,7 @@ class JointSideRecording:
         self.sha256 = motors.sha256
         self.joint_names = motors.joint_names
         self.joints = motors.joints
-        self.torque_held = motors.torque_held
+        self.torque_zero_order_hold = motors.torque_zero_order_hold
         self.torn = motors.torn
         self._motors = motors
         self._positions, self._torques = positions, torques
@@ -261,7 +262,7 @@ class MeasuredRecording:
     """Wrap a recording of this package and replace its torque by the measured one.
 
     Attributes:
-        share: of the samples, that have a measured torque of all joints.
+        share: share of the samples that have a measured torque of all joints.
         whole: the recording.
     """
 
@@ -278,7 +279,7 @@ class MeasuredRecording:
         self.sha256 = whole.sha256
         self.joint_names = whole.joint_names
         self.joints = whole.joints
-        self.torque_held = whole.torque_held
+        self.torque_zero_order_hold = whole.torque_zero_order_hold
         self.whole = whole
         self._stamps, self._torque = whole.measured(TOPIC)
         usable = np.isfinite(self._torque).all(axis=1)

@@ -58,7 +58,7 @@ class CachedRecording:
         self.sha256 = whole.sha256
         self.joint_names = whole.joint_names
         self.joints = whole.joints
-        self.torque_held = whole.torque_held
+        self.torque_zero_order_hold = whole.torque_zero_order_hold
         self.whole: Recording = whole
         self._whole, self._max_bytes = whole, max_bytes
         self._kept: Block | None = None

@@ -38,12 +38,12 @@ class CsvColumns:
     """Hold the column index, and the scale to SI, of each quantity in a row.
 
     Attributes:
-        names: of all columns, as the file has them.
+        names: names of all columns, as the file has them.
         time: index of the time.
         position: indices of the positions, joint 1 first, shape (joints,).
         torque: indices of the torques, shape (joints,).
         velocity: indices of the velocities, shape (joints,), or None.
-        nanoseconds: in one unit of the time column.
+        nanoseconds: nanoseconds in one unit of the time column.
         scale: factor from each column's unit to SI, shape (fields,); None where all are in SI.
         used: indices of all columns above, in the order of the file.
     """
@@ -195,14 +195,14 @@ class CsvRecording:
 
     Attributes:
         path: the file.
-        sha256: of the file's bytes, compressed where it is.
-        joint_names: those it was opened with, else empty.
+        sha256: hash of the file's bytes; of a compressed file, that of the compressed bytes.
+        joint_names: names of the joints that the file was opened with, else empty.
         joints: number of joints.
-        torque_held: False.
+        torque_zero_order_hold: False.
         torn: False; what does not fit raises.
     """
 
-    torque_held = False
+    torque_zero_order_hold = False
     torn = False
 
     def __init__(
@@ -217,8 +217,8 @@ class CsvRecording:
 
         Args:
             path: the file.
-            columns: for a file with another header, its column for each of `t`, `q1`, `tau1`, ...; columns that are
-                not named here are then left out.
+            columns: column of a file with another header for each of `t`, `q1`, `tau1`, ...; columns that are not named
+                here are then left out.
             joints: names of the joints 1..N, where they are known.
             skip_missing: whether to leave out rows in which a value other than the time is missing (an empty field,
                 `nan`, `NA`, `null`).

@@ -18,21 +18,21 @@ class Cycle(NamedTuple):
 
     Attributes:
         stamp_ns: monotonic time of the positions [ns].
-        position: measured [rad or m], shape (joints,).
-        velocity: measured by the drive [rad/s or m/s], shape (joints,), or None where it gives none.
-        torque: acts from this stamp until the next one [N m or N], shape (joints,).
-        reference_position: asked for [rad or m], shape (joints,).
-        reference_velocity: asked for [rad/s or m/s], shape (joints,).
-        cycle: its number.
-        lateness_ns: how late it began [ns].
-        compute_ns: how long it computed [ns].
-        valid: which axes answered, shape (joints,).
-        age: cycles since each answered, shape (joints,).
+        position: measured position [rad or m], shape (joints,).
+        velocity: velocity measured by the drive [rad/s or m/s], shape (joints,), or None where it gives none.
+        torque: torque that acts from this stamp until the next one [N m or N], shape (joints,).
+        reference_position: position asked for [rad or m], shape (joints,).
+        reference_velocity: velocity asked for [rad/s or m/s], shape (joints,).
+        cycle: number of the cycle.
+        lateness_ns: lateness of the cycle's beginning [ns].
+        compute_ns: computing time of the cycle [ns].
+        valid: mask of the axes that answered, shape (joints,).
+        age: number of cycles since each axis answered, shape (joints,).
         lost: frames lost so far.
-        measured_torque: by the drives, told with the positions: what acted until this stamp [N m or N], shape
-            (joints,), NaN where none was told; None where drives do not measure it.
-        joint_position: by encoders behind the transmission [rad or m], shape (joints,), NaN for joints without one;
-            None for an arm without any.
+        measured_torque: torque that acted until this stamp, measured by the drives and told with the positions [N m or
+            N], shape (joints,), NaN where none was told; None where drives do not measure it.
+        joint_position: position measured by encoders behind the transmission [rad or m], shape (joints,), NaN for
+            joints without one; None for an arm without any.
     """
 
     stamp_ns: int

@@ -34,8 +34,8 @@ class Samples:
 
     Attributes:
         stamp_ns: [ns since 1970 in UTC], shape (samples,).
-        position: measured [rad or m], shape (samples, joints).
-        torque: commanded, after clipping [N m or N], shape (samples, joints).
+        position: measured position [rad or m], shape (samples, joints).
+        torque: commanded torque after clipping [N m or N], shape (samples, joints).
         reference: position that was asked for [rad or m], shape (samples, joints).
         measured: torque that drives measured [N m or N], NaN where none was told, shape (samples, joints); None where
             the recording has none in these cycles.
@@ -53,8 +53,8 @@ class RecordingFollower:
 
     Attributes:
         ended: whether the recording's data has come to its end.
-        joint_names: in the order of the columns; empty before the first sample.
-        exciting_ns: when the motion itself began [ns since 1970 in UTC]; None before.
+        joint_names: names of the joints, in the order of the columns; empty before the first sample.
+        exciting_ns: time when the motion itself began [ns since 1970 in UTC]; None before.
         events: lines that were logged so far, at most `MOST_EVENTS`, stamps in ns since 1970 in UTC.
     """
 

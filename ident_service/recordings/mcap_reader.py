@@ -60,7 +60,7 @@ class Layout:
         names: of the joints, in the payload's order.
         position: offset of the first value [bytes], None where the sequence is empty; velocity and effort likewise.
         fixed: offsets of all bytes that make it this layout, shape (bytes,).
-        expected: their values, shape (bytes,).
+        expected: values of these bytes, shape (bytes,).
     """
 
     names: tuple[str, ...]
@@ -246,7 +246,7 @@ class Event:
     """Represent a line that was logged while recording.
 
     Attributes:
-        stamp_ns: on the recording's time axis [ns].
+        stamp_ns: stamp on the recording's time axis [ns].
         level: 10 debug, 20 information, 30 warning, 40 error, 50 fatal.
         name: of the logger.
         message: text that was logged.
@@ -263,9 +263,9 @@ class Extras:
     """Hold metadata, attachments, events and robot description of a recording.
 
     Attributes:
-        metadata: by name of the record; of several of one name the later entries count.
+        metadata: entries by name of the record; of several of one name the later entries count.
         attachments: content by name.
-        events: in the order of the file.
+        events: events, in the order of the file.
         robot_description: URDF, None where the file has none.
     """
 
@@ -285,7 +285,7 @@ def read_extras(
         stream: the file.
         size: how many bytes of it to read.
         utc_offset_ns: offset to subtract from the events' stamps [ns].
-        runs: of records, where the file's chunks have been expanded already.
+        runs: runs of records, where the file's chunks have been expanded already.
 
     Raises:
         RecordingError: attachments of more than 64 MiB, or a chunk that expands beyond that.
@@ -358,8 +358,8 @@ class Cycles:
     Attributes:
         lateness_ns: how late each began [ns], shape (cycles,).
         compute_ns: how long each computed [ns], shape (cycles,).
-        valid: which axes answered, shape (cycles, axes).
-        age: cycles since each answered, shape (cycles, axes).
+        valid: mask of the axes that answered, shape (cycles, axes).
+        age: number of cycles since each axis answered, shape (cycles, axes).
         lost: frames lost so far, shape (cycles,).
     """
 
@@ -456,10 +456,10 @@ class McapRecording:
 
     Attributes:
         path: the file.
-        sha256: of the bytes it had when opened; bytes that a writer adds later are not read.
-        joint_names: in the order of the block's columns.
+        sha256: hash of the bytes that the file had when opened; bytes that a writer adds later are not read.
+        joint_names: names of the joints, in the order of the block's columns.
         joints: number of joints.
-        torque_held: True for our own recordings.
+        torque_zero_order_hold: True for our own recordings.
         torn: whether the file ends, or is damaged, before its end mark.
         metadata: the record `ident`, empty for a bag.
         own: whether this package wrote it; topic, names and sides are then its own whatever the arm's bags are like.
@@ -478,7 +478,7 @@ class McapRecording:
 
         Args:
             path: the file.
-            topic: with sensor_msgs/msg/JointState on it; None takes `/joint_states`, or in a bag what `bag` says.
+            topic: topic with sensor_msgs/msg/JointState; None takes `/joint_states`, or in a bag what `bag` says.
             order: joints to read, in the order of the columns; None takes the first message's.
             bag: topic of a bag, its own names for joints that have others, and what to do with missing values.
 
@@ -503,7 +503,7 @@ class McapRecording:
         with self._open() if content is None else BytesIO(content) as stream:
             self._runs = self._verify(stream)
         self._offset_ns = self._utc_offset()
-        self.torque_held = self.metadata.get("torque_hold") == "zero_order"
+        self.torque_zero_order_hold = self.metadata.get("torque_hold") == "zero_order"
         self.own = bool(self.metadata)
         form = RecordingFormat() if self.own or bag is None else bag
         self._topic = form.topic if topic is None else topic
@@ -554,7 +554,7 @@ class McapRecording:
         """Read the torques that drives measured.
 
         Args:
-            topic: with sensor_msgs/msg/JointState that have effort only.
+            topic: topic with sensor_msgs/msg/JointState that have effort only.
 
         Returns:
             Stamps on the recording's time axis [ns], shape (messages,), and torques in the order of the joints [N m or

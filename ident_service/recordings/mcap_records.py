@@ -39,7 +39,7 @@ class Series(NamedTuple):
     """Hold messages of one channel that have one length.
 
     Attributes:
-        channel: its id.
+        channel: id of the channel.
         log_times: [ns], shape (messages,).
         payloads: shape (messages, bytes).
     """
@@ -61,10 +61,10 @@ class Period(NamedTuple):
     """Hold the messages of one cycle of a loop, of which whole runs consist.
 
     Attributes:
-        length: of all of its records [bytes].
-        where: places of their kinds, lengths and channels in it, shape (bytes,).
-        expected: what stands there, shape (bytes,).
-        wanted: places of those of them that are read, at most one.
+        length: length of all of its records [bytes].
+        where: places in the period of its records' kinds, lengths and channels, shape (bytes,).
+        expected: bytes that stand there, shape (bytes,).
+        wanted: places of those of its messages that are read, at most one.
     """
 
     length: int
@@ -210,9 +210,9 @@ def series(
     Where records repeat in kind, length and channel, as those of a loop do, all of them are found at once.
 
     Args:
-        run: of records.
-        directory: of the file so far.
-        choose: which channels to read, asked at each one's first message.
+        run: run of records.
+        directory: directory of the file so far.
+        choose: function that says which channels to read, called at each one's first message.
 
     Yields:
         Channel id, log time [ns] and payload; or several of one channel at once.

@@ -285,8 +285,8 @@ class CycleEncoder:
             cycle: number of the cycle.
             lateness_ns: how late the cycle began [ns].
             compute_ns: how long it computed [ns].
-            valid: which axes answered, shape (axes,).
-            age: cycles since each answered, shape (axes,).
+            valid: mask of the axes that answered, shape (axes,).
+            age: number of cycles since each axis answered, shape (axes,).
             lost: frames lost so far.
 
         Raises:
@@ -379,11 +379,11 @@ class RecordingWriter:
 
         Args:
             path: the finished file; neither it nor `<path>.partial` may exist.
-            joint_names: in the order of every vector.
+            joint_names: names of the joints, in the order of every vector.
             robot_description: URDF, as text.
             utc_offset_ns: offset from a stamp to UTC [ns since 1970].
             attachments: file name to content, such as the arm's configuration and the excitation.
-            metadata: added to the record `ident`.
+            metadata: entries added to the record `ident`.
 
         Raises:
             UsageError: no joints, a name twice, a metadata key that the writer sets itself.

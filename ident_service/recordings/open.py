@@ -37,8 +37,8 @@ def open_recording(
         joints: the arm's joints. An MCAP file's columns come in this order; a CSV file must have as many.
         fmt: how the file is to be read.
         transmission: the arm's gears, needed for a file that was recorded on the motor side.
-        torque: of this package's recordings, the commanded torque, the measured one, or the latter where
-            nearly every sample has it (None); files of others have one torque.
+        torque: kind of torque to read from this package's recordings; None for the measured one where nearly every
+            sample has it, else the commanded one. Files of others have one torque.
 
     Returns:
         The recording; its file is read when its blocks are.

@@ -42,9 +42,9 @@ class Frozen:
     """A stretch of time in which a position stays as it is, though the joint moved evenly up to the sample before.
 
     Attributes:
-        where: it begins [s] after the first sample of the recording.
-        speed: of the joint just before [rad/s or m/s].
-        seconds: that it lasts.
+        where: beginning of the stretch [s after the recording's first sample].
+        speed: speed of the joint just before [rad/s or m/s].
+        seconds: length of the stretch [s].
         torque: smallest and largest in it, after a quarter of a second [N m or N].
     """
 
@@ -59,21 +59,21 @@ class JointQuality:
     """Describe one joint in a recording.
 
     Attributes:
-        name: of the joint, or its number from 1.
+        name: name of the joint, or its number from 1.
         saturated: share of samples at the torque limit, or, where that is more, `clipped`.
         clipped: share of samples that sit exactly at the extreme torque five times in a row or more while the joint
             moves.
         standstill: share of the time that the joint is slower than 0.005 rad/s or m/s over 20 ms.
         position: smallest and largest [rad or m].
-        position_at: when it is there [s] after the first sample.
+        position_at: times of these positions [s after the first sample].
         torque: smallest and largest [N m or N].
-        smallest_step: of the position between samples [rad or m], which estimates the encoder's resolution; 0 for a
-            joint that never moves.
-        largest_step: of the position between neighbouring samples [rad or m].
-        speed: at that step [rad/s or m/s].
-        where: that step ends [s] after the first sample.
+        smallest_step: smallest step of the position between samples [rad or m], which estimates the encoder's
+            resolution; 0 for a joint that never moves.
+        largest_step: largest step of the position between neighbouring samples [rad or m].
+        speed: speed of the joint at that step [rad/s or m/s].
+        where: end of that step [s after the first sample].
         usual_step: root mean square of all other steps [rad or m].
-        steps: their number.
+        steps: number of all steps.
         frozen: the longest stretch of time in which the position is frozen; None for none.
     """
 
@@ -98,12 +98,12 @@ class Quality:
     """Describe the quality of a recording's stamps and joints.
 
     Attributes:
-        samples: their number after trimming.
-        duration_s: from the first to the last sample [s].
+        samples: number of samples after trimming.
+        duration_s: time from the first to the last sample [s].
         rate_hz: the usual rate [Hz].
         jitter_std_s: standard deviation of the steps, gaps excepted, from the usual step [s].
         jitter_max_s: largest difference [s].
-        gaps: from the last sample before to the first one after each.
+        gaps: segments from the last sample before each gap to the first one after it.
         longest_gap_s: [s], 0 without gaps.
         repeats: samples left out because they repeat the one before.
         arrival: whether the motion goes on evenly where the stamps do not, so that they say when a sample arrived and
@@ -112,7 +112,7 @@ class Quality:
         resampled: whether the samples are read off curves between the recorded ones.
         torn: whether the file was cut off or damaged.
         first_ns: stamp of the first sample [ns].
-        joints: in order.
+        joints: quality of each joint, in order.
         skipped: samples left out because a value is missing.
     """
 
@@ -174,9 +174,9 @@ def quality(recording: Recording, fmt: RecordingFormat, torque_limit: Array | No
     """Assess a recording, in constant memory.
 
     Args:
-        recording: read once more after `grid`.
+        recording: recording, which is read once more after `grid`.
         fmt: seconds to trim, and length of a gap.
-        torque_limit: of each joint [N m or N], shape (joints,), NaN where it is not known.
+        torque_limit: torque limit of each joint [N m or N], shape (joints,), NaN where it is not known.
 
     Raises:
         UsageError: not one limit a joint.

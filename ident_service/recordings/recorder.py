@@ -42,7 +42,7 @@ class RecorderProcess:
     """Manage a recorder process: entering starts the process and opens the file, leaving finishes both.
 
     Attributes:
-        report: how the recording ended, None until it has, or where the process died.
+        report: report of the recording's end; None until it has ended, or where the process died.
     """
 
     def __init__(
@@ -62,15 +62,15 @@ class RecorderProcess:
         """Check the request; nothing is started or written before the context is entered.
 
         Args:
-            path: of the recording, as for `RecordingWriter`.
-            joint_names: in the order of every vector.
+            path: path of the recording, as for `RecordingWriter`.
+            joint_names: names of the joints, in the order of every vector.
             robot_description: URDF, as text.
             utc_offset_ns: offset from a stamp to UTC [ns since 1970].
             attachments: file name to content.
-            metadata: added to the record `ident`.
+            metadata: entries added to the record `ident`.
             lock_step: whether time waits for the recorder (a clock's `lock_step`).
-            slots: records that the ring holds.
-            share: of the ring that may wait to be taken before `put` answers False.
+            slots: number of records that the ring holds.
+            share: share of the ring that may wait to be taken before `put` answers False.
             local: whether this process puts; otherwise one that is given `ends`.
 
         Raises:

@@ -52,9 +52,9 @@ class RecorderReport:
     """Describe how a recording ended.
 
     Attributes:
-        samples: cycles written.
-        events: events of the motion written.
-        lost: records of the ring that were overrun.
+        samples: number of cycles written.
+        events: number of events of the motion written.
+        lost: number of records of the ring that were overrun.
         complete: whether the file says that it is complete.
         error: description of the failure, empty without one.
     """
@@ -80,9 +80,9 @@ class RingConsumer:
         """Use the given reader and writer.
 
         Args:
-            reader: attached as the recorder.
-            writer: entered.
-            channel: readable when the parent has ended.
+            reader: reader that is attached to the ring as the recorder.
+            writer: writer whose context has been entered.
+            channel: file descriptor that is readable when the parent has ended.
             work: event counter on which a sink asks for attention.
             room: event counter on which a sink waits, None without lock step.
         """

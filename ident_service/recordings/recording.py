@@ -82,19 +82,20 @@ class Recording(Protocol):
 
     Attributes:
         path: the file.
-        sha256: of the file's bytes.
-        joint_names: in the order of the block's columns; empty where the file names none (CSV `q1..qN`).
+        sha256: hash of the file's bytes.
+        joint_names: names of the joints, in the order of the block's columns; empty where the file names none (CSV
+            `q1..qN`).
         joints: number of joints.
-        torque_held: True when the torque of a sample acts from its stamp until the next stamp (our own recordings:
-            a zero-order hold), False when it was sampled at its stamp.
-        torn: True when the file ended in the middle of a record and was read up to there.
+        torque_zero_order_hold: whether the torque of a sample acts from its stamp until the next stamp, as in our own
+            recordings; otherwise it was sampled at its stamp.
+        torn: whether the file ended in the middle of a record and was read up to there.
     """
 
     path: Path
     sha256: str
     joint_names: tuple[str, ...]
     joints: int
-    torque_held: bool
+    torque_zero_order_hold: bool
     torn: bool
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:

@@ -76,11 +76,11 @@ class Grid:
     """Describe the stamps of a recording, after trimming.
 
     Attributes:
-        period_s: of the uniform samples made of it [s].
-        own_period_s: its usual step [s].
+        period_s: period of the uniform samples made of it [s].
+        own_period_s: usual step of the recording [s].
         first_ns: stamp of the first sample [ns].
         last_ns: stamp of the last sample [ns].
-        samples: their number, repeated ones not counted.
+        samples: number of samples, repeated ones not counted.
         repeats: number of samples left out because they repeat the one before.
         skipped: number of samples left out because a value is missing.
         regular: whether all steps but gaps are `own_period_s` to 0.1 %.
@@ -210,7 +210,7 @@ def trimmed(blocks: Iterable[Block], trim: tuple[float, float]) -> Iterator[Bloc
     """Yield blocks without the first and the last seconds; holds back as many samples as the last seconds have.
 
     Args:
-        blocks: of a recording, in order.
+        blocks: blocks of a recording, in order.
         trim: seconds to leave out at the start and at the end [s].
     """
     at_start, at_end = (round(seconds * 1e9) for seconds in trim)
@@ -311,7 +311,7 @@ class UniformRun:
     """Hold consecutive samples of a segment, as far apart as `Grid.period_s`.
 
     Attributes:
-        block: at least one sample; the stamps are the uniform times rounded to whole nanoseconds.
+        block: block of at least one sample; its stamps are the uniform times rounded to whole nanoseconds.
         start: whether the segment begins here.
         end: whether the segment ends here.
     """
@@ -333,14 +333,14 @@ def uniform(
 
     A regular recording passes through bit for bit, cut at its gaps; so do the values of one whose stamps are of
     arrival, which get even stamps from each segment's first one on. Any other is resampled at `first + k period` in all
-    segments; of samples closer than a tenth of a period the first is used. `recording.torque_held` stays true of the
-    result.
+    segments; of samples closer than a tenth of a period the first is used. `recording.torque_zero_order_hold` stays
+    true of the result.
 
     Args:
         recording: to be read.
         fmt: seconds to trim, length of a gap, and the rate.
-        known: its `grid(recording, fmt)`, where that has been found already.
-        shortest_s: segments shorter than `Grid.least_s` of this are left out [s].
+        known: result of `grid(recording, fmt)`, where that has been found already.
+        shortest_s: least duration of the segments that are read [s]; more where resampling needs it (`Grid.least_s`).
         samples: how many samples to read at a time.
 
     Raises:
@@ -369,7 +369,7 @@ def uniform(
         if fmt.stamps == "arrival" and not stamps.regular:
             blocks = _evenly(blocks, stamps, segment)
         if stamps.resampled:
-            blocks = _resampled(blocks, stamps, segment, recording.torque_held)
+            blocks = _resampled(blocks, stamps, segment, recording.torque_zero_order_hold)
         yield from _with_ends(blocks)
 
 

@@ -134,9 +134,9 @@ def create_memory(joints: int, slots: int, slot_bytes: int) -> int:
     """Create the memory of a ring, all of it allocated, and nothing written yet.
 
     Args:
-        joints: of every record, 1 to 64.
-        slots: records that fit, 4 to 2**20.
-        slot_bytes: of one slot [bytes].
+        joints: number of joints in every record, 1 to 64.
+        slots: number of records that fit, 4 to 2**20.
+        slot_bytes: size of one slot [bytes].
 
     Returns:
         Its file descriptor, which the caller closes and which no child inherits unless it is passed.
@@ -167,9 +167,9 @@ class RingMemory:
     """Map a ring's memory into one process.
 
     Attributes:
-        joints: of every record.
-        slots: how many there are.
-        slot_bytes: of one slot.
+        joints: number of joints in every record.
+        slots: number of slots.
+        slot_bytes: size of one slot [bytes].
         words: the memory as 64-bit words.
         content: the memory as bytes.
     """
@@ -178,7 +178,7 @@ class RingMemory:
         """Map the memory; its layout is read from its header.
 
         Args:
-            fd: from `create_memory`, in whatever process; stays the caller's.
+            fd: file descriptor from `create_memory`, in whatever process; stays the caller's.
             writable: False for a reader who leaves no trace.
 
         Raises:
@@ -316,15 +316,15 @@ class RingWriter:
     """Write records to a ring as its only writer.
 
     Attributes:
-        memory: the ring's.
-        written: records so far.
+        memory: memory of the ring.
+        written: number of records written so far.
     """
 
     def __init__(self, fd: int) -> None:
         """Attach to a ring as its writer.
 
         Args:
-            fd: of the ring; stays the caller's.
+            fd: file descriptor of the ring; stays the caller's.
 
         Raises:
             UsageError: not a ring, or a ring that has a writer.
@@ -424,17 +424,17 @@ class RingReader:
     """Read records of a ring with a cursor of its own; a context manager.
 
     Attributes:
-        memory: the ring's; writable only for the recorder.
+        memory: memory of the ring, writable only for the recorder.
         cursor: number of the next record; `returned + lost` when it began at 0.
-        returned: records that `read` gave.
-        lost: records that it could not give.
+        returned: number of records that `read` returned.
+        lost: number of records that `read` could not return.
     """
 
     def __init__(self, fd: int, *, recorder: bool = False, from_now: bool = False) -> None:
         """Attach to a ring, at its first record.
 
         Args:
-            fd: of the ring; stays the caller's.
+            fd: file descriptor of the ring; stays the caller's.
             recorder: whether this is the reader whose progress the motion loop watches (`ring_sink.py`).
             from_now: begin behind what has been written so far.
 

@@ -77,10 +77,11 @@ class RingSink:
         """Attach to the ring as its writer.
 
         Args:
-            ends: to the recorder, which is running; they stay the caller's, and open as long as this is used.
+            ends: ends of the connection to the recorder, which is running; they stay the caller's, and open as long as
+                this is used.
             path: of the recording, for messages.
             lock_step: whether time waits for the recorder (a clock's `lock_step`).
-            share: of the ring that may wait to be taken, 0 to 1; 0 in lock step waits for every single record.
+            share: share of the ring that may wait to be taken, 0 to 1; 0 in lock step waits for every single record.
             patience: how long to wait for a recorder that takes nothing [s]; in lock step.
 
         Raises:

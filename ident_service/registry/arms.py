@@ -38,9 +38,9 @@ class KnownArm:
     """Arm that the service knows.
 
     Attributes:
-        name: which is its id.
-        path: of its description, to give to the commands.
-        config: its description, read just now.
+        name: name of the arm, which is its id.
+        path: path of its description, for commands.
+        config: configuration, read just now.
         source: `shipped` or `uploaded`.
     """
 
@@ -129,10 +129,12 @@ def add_arm(
         state: the state folder.
         text: the YAML.
         files: name to content of the files that it names.
-        by: who.
-        replace: whether it may take the place of another of its name, a shipped one included.
-        judge: raises where something is wrong with the arm of a description that was not known; it takes seconds.
-        draw: makes, of a description, the folder with what viewers draw of it (`drawn_meshes`); None without meshes.
+        by: name of the requester.
+        replace: whether it may take the place of another description of its name, a shipped one included.
+        judge: function that raises where something is wrong with the arm of a description that was not known; it takes
+            seconds.
+        draw: function that makes, from a description, the folder with what viewers draw of it (`drawn_meshes`); None
+            without meshes.
 
     Raises:
         AlreadyThere: its name is taken by another description.
@@ -189,9 +191,9 @@ def mesh_file(state: Path, arm: str, sha256: str, joint: int) -> bytes:
 
     Args:
         state: the state folder.
-        arm: its name.
-        sha256: of its description; the first 16 digits count.
-        joint: its number; -1 for the base.
+        arm: name of the arm.
+        sha256: hash of its description, of which the first 16 digits count.
+        joint: number of the joint; -1 for the base.
 
     Raises:
         UnknownId: there are none.

@@ -274,7 +274,7 @@ def registry_error(path: Path, error: Exception) -> IdentError:
 
     Args:
         path: the registry's file.
-        error: as it was raised, by SQLite or the operating system.
+        error: error of SQLite or the operating system.
     """
     if (short := shortage(path, error)) is not None:
         return short
@@ -433,12 +433,12 @@ class Database:
         """Return rows, or those of an arm, the newest first.
 
         Args:
-            table: of the rows.
-            what: they are, for the error.
-            at: column with their time.
+            table: table of the rows.
+            what: name of the rows, for the error.
+            at: column with the rows' time.
             arm: name; all arms when None.
             before: id of the row before the first; the first of all when None.
-            most: rows.
+            most: largest number of rows.
 
         Raises:
             UnknownId: there is no row of that id.

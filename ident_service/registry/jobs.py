@@ -117,7 +117,7 @@ def enter_key(db: Database, who: str, key: str, request: str, job: str) -> None:
     Args:
         db: the registry.
         who: name of the token.
-        key: of the request; each token has its own.
+        key: idempotency key of the request; each token has its own keys.
         request: SHA-256 of the request's content.
         job: id.
 

@@ -45,8 +45,8 @@ def add_motion(db: Database, state: Path, arm: str, text: str, by: str, joints: 
         state: the state folder.
         arm: name of the arm that it is for.
         text: content of the motion's file.
-        by: who.
-        joints: how many the arm has.
+        by: name of the requester.
+        joints: number of joints of the arm.
 
     Raises:
         UsageError: not a motion, or one of an arm with another number of joints; the message says what is wrong.

@@ -156,9 +156,9 @@ def label_run(db: Database, run: str, tags: Sequence[str], words: str, who: str)
     Args:
         db: the registry.
         run: id.
-        tags: words by which runs are found again; none takes them away.
+        tags: words by which runs are found again; an empty list takes the tags away.
         words: the note; may be empty.
-        who: gives them.
+        who: name of the requester.
 
     Returns:
         The labels (`run_labels`).

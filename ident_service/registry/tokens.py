@@ -32,7 +32,7 @@ class Access:
 
     Attributes:
         name: of the token.
-        role: what it may do; an operator may do what a viewer may.
+        role: role of the caller; an operator may do what a viewer may.
     """
 
     name: str
@@ -91,8 +91,8 @@ def begin_session(db: Database, session: str, secret: str, until: float, most: i
         db: the registry.
         session: random word of the session's cookie, of which only the digest is stored.
         secret: the token that it was exchanged for; it ends with that, too.
-        until: when it ends [s since 1970 in UTC].
-        most: how many there may be.
+        until: end of the session [s since 1970 in UTC].
+        most: largest number of sessions.
     """
     with db.transaction():
         db.write("DELETE FROM sessions WHERE until < ?", time.time())

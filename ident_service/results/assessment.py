@@ -28,15 +28,17 @@ class JointAssessment:
 
     Attributes:
         place: number of the joint, from 0.
-        joint: its name.
-        unit: of its torque, `N m` or `N`; empty where the file does not say.
+        joint: name of the joint.
+        unit: unit of the joint's torque, `N m` or `N`; empty where the file does not say.
         fitted: relative torque error (eq. 84) on the fitted recordings, all rows [percent of the joint's own torque].
-        fitted_moving: likewise without rows near standstill.
-        unseen: as `fitted`, of the worst recording that was not fitted to; None where there is none.
-        unseen_moving: as `fitted_moving`, likewise.
-        torque: root mean square of the measured torque [N m or N], of the recording that decides.
-        residual: likewise of the residual.
-        word: what the joint's predicted torque is good for.
+        fitted_moving: relative torque error as `fitted`, without rows near standstill.
+        unseen: relative torque error as `fitted`, on the worst recording that was not fitted to; None where there is
+            none.
+        unseen_moving: relative torque error as `fitted_moving`, on the worst recording that was not fitted to; None
+            where there is none.
+        torque: root mean square of the measured torque [N m or N], on the recording that decides.
+        residual: root mean square of the residual [N m or N], on the recording that decides.
+        word: verdict on the use of the joint's predicted torque.
     """
 
     place: int
@@ -71,7 +73,7 @@ class Assessment:
     """Verdict on an estimate.
 
     Attributes:
-        word: what its values are good for.
+        word: verdict on the use of its values.
         line: the verdict in one sentence.
         reasons: the three that matter most, those against it first.
         further: all others.
@@ -128,8 +130,8 @@ def assess_estimate(estimate: Estimate, unusable: Sequence[str] = (), warnings: 
     """Assess an estimate as its parameter file will be, before there is one.
 
     Args:
-        estimate: to assess.
-        unusable: why it must not be used.
+        estimate: estimate to assess.
+        unusable: reasons why it must not be used.
         warnings: what is wrong with the recordings, in words.
     """
     second = estimate.second

@@ -158,7 +158,7 @@ def verified_files(folder: Path, *, but: frozenset[str] = frozenset()) -> Mappin
     """Return name to SHA-256, each verified on a regular file, not on a link.
 
     Args:
-        folder: to be read.
+        folder: folder to be read.
         but: names that may be gone, because a retention policy let them go.
 
     Raises:
@@ -251,7 +251,8 @@ def replacing_folder(folder: Path, require: Callable[[Path], None] = require_rep
 
     Args:
         folder: of the results.
-        require: raises where the folder holds anything but an earlier result; asked before and after the block.
+        require: function that raises where the folder holds anything but an earlier result; called before and after the
+            block.
 
     Raises:
         UsageError: the folder may not be replaced, or cannot be written.

@@ -43,7 +43,7 @@ class MotionTraces:
         velocity_limit: largest speed, above zero, shape (joints,), or None; likewise the next two.
         acceleration_limit: largest acceleration.
         torque_limit: largest torque.
-        units: of every joint's position, `rad` or `m`.
+        units: units of every joint's position, `rad` or `m`.
         ramps: stretches of time that lead into or out of the motion, (from, to) [s].
     """
 
@@ -122,7 +122,7 @@ def joints_over_time(traces: MotionTraces, title: str = "Motion of the joints") 
 
     Args:
         traces: the motion and its limits.
-        title: what the drawing is of.
+        title: subject of the drawing.
 
     Returns:
         A self-contained SVG, at most about 10 kB per panel whatever the number of samples.

@@ -77,9 +77,9 @@ def require_schema(content: Any, name: str, where: object, what: str) -> None:
 
     Args:
         content: JSON values.
-        name: of the schema: `parameters`, `evidence`, `comparison` or `payload`.
+        name: name of the schema: `parameters`, `evidence`, `comparison` or `payload`.
         where: file that it comes from or goes to.
-        what: it ought to be, for the message.
+        what: description of the document that is expected, for the message.
 
     Raises:
         ParameterError: it does not fit; the first mistakes with their places.
@@ -129,7 +129,7 @@ def information_from(joints: list[dict[str, Any]], base: int) -> Information:
     """Return the information of a document, the inverse of `information_document`.
 
     Args:
-        joints: as it was written.
+        joints: JSON value that `information_document` made.
         base: number of base parameters.
 
     Raises:
@@ -168,7 +168,7 @@ class ParameterFile:
         values: base parameters in SI units, shape (base,).
         feasible_set: the set it claims, or None.
         content: everything in it, names in our notation.
-        notes: what a reader should know of names that were translated.
+        notes: notes for the reader on names that were translated.
     """
 
     base: BaseParameters
@@ -187,7 +187,7 @@ def read_parameters(
         path: the file, or the folder of results that holds it.
         names: the link parameters of an arm; without them, the ten of every link up to the highest number that the
             expressions mention, and the joint terms that they mention.
-        notation: of the file's names, where it is not ours.
+        notation: notation of the file's names, where it is not ours.
 
     Raises:
         UsageError: no such file.
@@ -253,7 +253,7 @@ def parameters_document(estimate: Estimate, described: ArmConfig | None = None) 
     """Return the content of `parameters.json` for an estimate, its feasibility certified in exact arithmetic.
 
     Args:
-        estimate: what was identified.
+        estimate: identified estimate.
         described: the arm's description as it was read, where options or recordings changed it; sections that differ
             are named in the file, so that its hash can be compared with that of the description.
 
@@ -453,8 +453,8 @@ def require_consistent(file: ParameterFile, where: Path) -> None:
     """Check that the values of a parameter file belong together.
 
     Args:
-        file: what was read.
-        where: from, for errors.
+        file: parameter file that was read.
+        where: origin of the file, for errors.
 
     Raises:
         ParameterError: a number that no parameter has; base values that the link values do not have; or, without
@@ -496,7 +496,7 @@ def require_base_values(base: BaseParameters, delta: Array, values: Array, where
         base: the grouping.
         delta: link values in its order, shape (parameters,).
         values: base values, shape (base,).
-        where: they come from, for errors.
+        where: origin of the values, for errors.
 
     Raises:
         ParameterError: they do not.

@@ -52,9 +52,9 @@ def payload_document(payload: Payload, arm: KnownArm, arm_sha256: str, recording
     """Return the content of `payload.json`.
 
     Args:
-        payload: what was found.
-        arm: that carries it.
-        arm_sha256: of the arm's parameter file.
+        payload: identified payload.
+        arm: arm that carries it.
+        arm_sha256: hash of the arm's parameter file.
         recordings: name and sha256 of each.
     """
     base, center = payload.base, center_of_mass(payload)
@@ -207,9 +207,9 @@ def loaded_parameters(
     """Return the content of `parameters.json` of the arm with its payload, or without what was taken off.
 
     Args:
-        content: of the arm's parameter file.
-        arm: as it was identified.
-        payload: with a body.
+        content: content of the arm's parameter file.
+        arm: the arm as it was identified.
+        payload: payload with a body.
         recorded: equations of the second recording.
         recordings: name and sha256 of each.
 

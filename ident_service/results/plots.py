@@ -251,9 +251,9 @@ class Canvas:
         """Return the whole drawing.
 
         Args:
-            title: what a screen reader says first.
-            description: what the drawing shows, for who cannot see it.
-            inline: for a page that has the style sheet once and knows what an SVG is.
+            title: title, which a screen reader says first.
+            description: content of the drawing, for readers who cannot see it.
+            inline: whether it is for a page that has the style sheet once and knows what an SVG is.
         """
         space = "" if inline else ' xmlns="http://www.w3.org/2000/svg"'
         head = (
@@ -321,10 +321,10 @@ def require_drawable(name: str, values: Array, shape: tuple[int, ...], *, unlimi
     """Refuse values that cannot be drawn.
 
     Args:
-        name: what the values are, for the message.
-        values: to be drawn.
-        shape: what they must have.
-        unlimited: infinities may stand for limits that are not there.
+        name: name of the values, for the message.
+        values: values to be drawn.
+        shape: required shape.
+        unlimited: whether infinities may stand for limits that are not there.
 
     Raises:
         UsageError: nothing in it, another shape, or values that are NaN or (where not `unlimited`) infinite or huge.
@@ -348,10 +348,10 @@ def range_around(*values: Array, least: float = 0.0, zero: bool = False, share: 
     """Return a range that holds all finite values with room for the lines' own width.
 
     Args:
-        values: of any shapes.
-        least: how long the range is at least.
-        zero: whether it holds zero.
-        share: of its length, that is left free at either end.
+        values: values, of any shapes.
+        least: least length of the range.
+        zero: whether the range holds zero.
+        share: share of the range that is left free at either end.
     """
     everything = np.concatenate([np.ravel(one)[np.isfinite(np.ravel(one))] for one in values])
     low, high = (float(everything.min()), float(everything.max())) if len(everything) else (0.0, 0.0)
@@ -377,11 +377,11 @@ def draw_frame(
 
     Args:
         canvas: to draw on.
-        axes: where; of a quantity in powers of ten they show the logarithm.
+        axes: axes of the frame; of a quantity in powers of ten they show the logarithm.
         x: name and unit of what lies across; no numbers either where it is empty.
-        y: of what stands upright, written above the frame.
+        y: name and unit of the upright quantity, written above the frame.
         x_log: whether the axes show the logarithm of x.
-        y_log: likewise.
+        y_log: whether the axes show the logarithm of y.
         y_ticks: values upright and their words, where the scale is neither straight nor in powers of ten.
     """
     bottom, right = axes.top + axes.height, axes.left + axes.width
@@ -406,8 +406,8 @@ def draw_key(canvas: Canvas, right: float, y: float, entries: Sequence[tuple[str
 
     Args:
         canvas: to draw on.
-        right: where the row ends.
-        y: its base line.
+        right: right end of the row [px].
+        y: base line of the row [px].
         entries: form (`line`, `area` or `dot`), kind, words.
     """
     at = right

@@ -48,7 +48,7 @@ class Postures:
         frames: origins of links, base and tool among them [m], shape (postures, points, 3).
         times: increasing [s], shape (postures,).
         branches: for every branch of the arm the points from base to tool, two or more.
-        obstacles: what does not move, by name.
+        obstacles: bodies that do not move, by name.
         workspace: lowest and highest corner of the box that the arm must stay in [m], shape (2, 3); infinite where it
             is open; or None.
         closest: the posture of smallest clearance, or None.
@@ -230,7 +230,7 @@ def stick_figure(postures: Postures, title: str = "The arm along its motion") ->
 
     Args:
         postures: the arm and its surroundings.
-        title: what the drawing is of.
+        title: subject of the drawing.
 
     Returns:
         A self-contained SVG.
@@ -280,11 +280,11 @@ def spike_figure(
 
     Args:
         mechanism: of the arm.
-        joint: its number.
-        time: since the recording's first sample [s].
-        residual: of the joint [N m or N].
-        position: of all joints then [rad or m], shape (joints,).
-        inline: for a page that has the style sheet once.
+        joint: number of the joint.
+        time: time since the recording's first sample [s].
+        residual: residual of the joint [N m or N].
+        position: position of all joints at that time [rad or m], shape (joints,).
+        inline: whether it is for a page that has the style sheet once.
 
     Returns:
         An SVG, self-contained where it is not for such a page.
@@ -322,7 +322,7 @@ def silhouette(limbs: Sequence[Limb], title: str) -> str:
 
     Args:
         limbs: parts of the arm, one at least.
-        title: what the picture is of.
+        title: subject of the picture.
 
     Returns:
         A self-contained SVG.

@@ -46,10 +46,10 @@ def write_report(
     """Write evidence and report into a folder that has the other files of the estimate, before its manifest.
 
     Args:
-        folder: where `write_results` has written.
-        estimate: made from `recordings`, judged on `validation`.
-        recordings: those fitted to.
-        validation: those that were not.
+        folder: folder that `write_results` has written.
+        estimate: estimate made from `recordings` and judged on `validation`.
+        recordings: recordings that were fitted to.
+        validation: recordings that were not fitted to.
         warnings: what is wrong with the recordings, in words.
 
     Returns:
@@ -105,8 +105,8 @@ def make_report(folder: Path, out: Path | None = None) -> tuple[Path, Assessment
     """Make the report of a folder of results again.
 
     Args:
-        folder: made by `ident identify` or `ident simulate`.
-        out: where the page goes; into the folder, whose manifest then names it, when None.
+        folder: folder made by `ident identify` or `ident simulate`.
+        out: path of the page; in the folder, whose manifest then names it, when None.
 
     Returns:
         The page, and the assessment on top of it.
@@ -144,7 +144,7 @@ def write_figures(run: Path, out: Path, form: Literal["svg", "png"]) -> list[str
     Args:
         run: folder of results with evidence.
         out: folder to write into.
-        form: of the files.
+        form: format of the files.
 
     Returns:
         The names of the files, in the order of the report.

@@ -37,7 +37,7 @@ class Results:
     """Folder of results that has been read and is what its manifest says.
 
     Attributes:
-        folder: where it is.
+        folder: folder of the results.
         config: the arm as the parameters were identified for it, what the recordings said of its friction included.
         parameters: the parameter file.
         sha256: name to SHA-256 of every file that the manifest names.
@@ -80,12 +80,13 @@ def write_results(
     """Write an estimate's files into an existing folder, with the program that checks its certificate.
 
     Args:
-        folder: where to.
-        estimate: what to write.
+        folder: folder to write.
+        estimate: estimate to write.
         more: further entries of `parameters.json`.
-        unusable: why the estimate must not be used.
+        unusable: reasons why the estimate must not be used.
         described: the arm's description as it was read, where options or recordings changed it.
-        torque: that the recordings give: `measured` by the drives, `commanded`, or `recorded` by another program.
+        torque: kind of torque in the recordings: `measured` by the drives, `commanded`, or `recorded` by another
+            program.
 
     Returns:
         The names of the files. An estimate that no body has comes without a URDF, because URDF cannot express it.

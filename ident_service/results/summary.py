@@ -30,7 +30,7 @@ def rows_and_filter(options: Identification) -> tuple[str, ...]:
     """Describe the rows and the filters behind relative torque errors (eq. 84), one sentence each.
 
     Args:
-        options: with which the equations were made.
+        options: options that the equations were made with.
     """
     smoothing, reversal = options.smoothing, options.reversal
     if "choose" in (smoothing.cutoff, smoothing.decimate, options.edge):
@@ -78,7 +78,7 @@ def noise_and_model(noise: Array | None, variances: Array) -> str:
     Args:
         noise: standard deviations by what differs between repetitions of the motion, shape (base,); None where most of
             the motion is not repeated.
-        variances: of the parameters, shape (base,); infinite or NaN where unknown.
+        variances: variances of the parameters, shape (base,); infinite or NaN where unknown.
     """
     if noise is None:
         return "Most of the motion is not repeated, so noise and model error cannot be separated."
@@ -115,8 +115,8 @@ def implausible_links(estimate: Estimate) -> tuple[str, ...]:
     """Return a sentence for each link whose chosen values are implausible: the value and its bound.
 
     Args:
-        estimate: with link values; one without, or with values that a prior or custom knowledge asked for, has none
-            to name.
+        estimate: estimate with link values; one without, or with values that a prior or custom knowledge asked for, has
+            none to name.
     """
     if estimate.delta is None or estimate.nearest_to is None:
         return ()
@@ -151,9 +151,9 @@ def summary(
     """Describe an estimate in lines no wider than a terminal: verdict, reasons, a row per joint, then details.
 
     Args:
-        estimate: to describe.
-        unusable: why it must not be used; that comes first.
-        torque: that the recordings give: `measured`, `commanded`, or `recorded` by another program.
+        estimate: estimate to describe.
+        unusable: reasons why it must not be used, which come first.
+        torque: kind of torque in the recordings: `measured`, `commanded`, or `recorded` by another program.
         warnings: what is wrong with the recordings, in words.
     """
     own = estimate.candidates[estimate.chosen]
@@ -209,7 +209,7 @@ def assessment_lines(found: Assessment) -> list[str]:
     """Return the verdict, its reasons and a row per joint, as lines for a terminal.
 
     Args:
-        found: to be shown.
+        found: assessment to show.
     """
     head = found.word.upper() + found.line[len(found.word) :]
     if found.word == "do not use":

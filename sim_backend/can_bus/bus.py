@@ -43,13 +43,13 @@ class IdentWireBus(can.BusABC):
 
         Args:
             channel: name or path of the wire.
-            can_filters: as python-can's.
+            can_filters: filters as python-can's.
             receive_own_messages: whether to hear what is sent here.
             host: run the wire in a thread of this process, for experiments and tests.
             pace: whether a wire that is hosted here keeps `bitrate`.
-            bitrate: of a wire that is hosted here [bit/s].
+            bitrate: bit rate of a wire that is hosted here [bit/s].
             fd: whether a wire that is hosted here carries CAN FD.
-            data_bitrate: of a wire that is hosted here, for its pace of CAN FD's data [bit/s].
+            data_bitrate: bit rate of CAN FD's data on a wire that is hosted here [bit/s].
             kwargs: ignored, as python-can's own interfaces do.
 
         Raises:

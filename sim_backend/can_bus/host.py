@@ -31,8 +31,8 @@ class LocalPort:
         """Add a port to an entered wire.
 
         Args:
-            wire: that the port is added to.
-            label: of the port, for people.
+            wire: wire that the port is added to.
+            label: label of the port, for people.
         """
         self.clock = RealClock()
         self.port = BusEndpoint(label, fd=wire.fd)

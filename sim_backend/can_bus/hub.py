@@ -63,9 +63,10 @@ class CanBusServer:
         Args:
             name: channel that ends connect to: a name, or the path of a socket file.
             bitrate: pace to keep [bit/s]; 0: none.
-            data_bitrate: of the data of CAN FD's frames [bit/s]; None: the wire has none, but for `fd`.
+            data_bitrate: bit rate of the data of CAN FD's frames [bit/s]; None: the wire has none, but for `fd`.
             fd: whether frames may be CAN FD's although there is no pace.
-            duration_ns: how long a frame occupies the wire, instead of its bits at these rates.
+            duration_ns: function that returns the time for which a frame occupies the wire [ns], instead of its bits at
+                these rates.
 
         Raises:
             DriverError: a pace for CAN FD without its data bit rate.

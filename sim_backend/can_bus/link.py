@@ -263,7 +263,7 @@ class WireLink:
         """Use an open connection, and close it with the link.
 
         Args:
-            connection: greeted.
+            connection: connection that has been greeted.
             fd: whether data frames are sent as CAN FD's; by default where the wire carries them.
         """
         self.clock = RealClock()

@@ -45,7 +45,7 @@ class ErrorCounters:
 
     Attributes:
         sending, receiving: the counters, each at most 256.
-        state: of the controller.
+        state: state of the controller.
     """
 
     def __init__(self) -> None:
@@ -121,8 +121,8 @@ class BusEndpoint:
 
     Attributes:
         label: name of the controller, for people and for injecting errors.
-        pid: its process.
-        counters: its error counters.
+        pid: id of its process.
+        counters: error counters of its controller.
         inbox: frames that it received and that are not taken yet, each with whether it was its own.
         fd: whether its controller knows CAN FD; one that does not destroys such frames of others.
         lost: frames that found its inbox full.
@@ -140,9 +140,9 @@ class BusEndpoint:
         """Create a port that is not on any wire yet.
 
         Args:
-            label: for people.
-            pid: of the process behind it.
-            own: whether it hears its own frames.
+            label: name for people.
+            pid: id of the process behind it.
+            own: whether the port hears its own frames.
             filters: identifier and mask, any of which lets a standard frame pass; none lets all frames pass.
             fd: whether its controller knows CAN FD.
         """
@@ -185,7 +185,7 @@ class Medium:
     """Emulate the wire and its ports.
 
     Attributes:
-        ports: in the order in which they came.
+        ports: ports in the order in which they came.
         sent: frames that all ports received.
         destroyed: frames that no port received.
         collisions: frames that met one with the same arbitration field from another port: two nodes with one number.
@@ -197,8 +197,9 @@ class Medium:
         """Create a wire without ports.
 
         Args:
-            duration_ns: how long a frame occupies the wire; None: not at all, and all that waits contends at once.
-            error_ns: how long an error frame does.
+            duration_ns: function that returns the time for which a frame occupies the wire [ns]; None: no time, and all
+                that waits contends at once.
+            error_ns: time for which an error frame occupies the wire [ns].
             fd: whether the wire itself carries CAN FD.
         """
         self.ports: list[BusEndpoint] = []

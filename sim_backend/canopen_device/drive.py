@@ -422,11 +422,11 @@ class CanopenDrive:
     """Emulate one node with its motor; implements the interface of `sim_backend/emulator/face.py`.
 
     Attributes:
-        objects: its object dictionary.
-        motor: that it drives.
-        emergency: its errors.
-        nmt: its state in the network.
-        power: its state as a drive.
+        objects: object dictionary of the drive.
+        motor: motor that it drives.
+        emergency: errors of the drive.
+        nmt: state of the drive in the network.
+        power: state of the drive by CiA 402.
         sync_identifier: identifier of SYNC frames.
         deaf: whether a defect makes it go on when its watchdogs should stop it.
     """
@@ -445,10 +445,10 @@ class CanopenDrive:
         Args:
             eds: text of its electronic data sheet.
             number: node id.
-            motor: that it drives.
+            motor: motor that it drives.
             own: numbers that its entries have instead of what the EDS says, by key.
-            like: its properties that are not in the EDS.
-            tuning: of its position loop.
+            like: properties of the drive that are not in the EDS.
+            tuning: tuning of its position loop.
 
         Raises:
             DriverError: an EDS that cannot be read.
@@ -511,8 +511,8 @@ class CanopenDrive:
         """Process a frame of another node.
 
         Args:
-            frame: of any kind; what is not for this drive does nothing.
-            now_ns: when, not before the last call.
+            frame: frame of any kind; one that is not for this drive does nothing.
+            now_ns: present time [ns], not before that of the last call.
 
         Returns:
             What the drive sends, in order.
@@ -597,8 +597,8 @@ class CanopenDrive:
         """Simulate a fault that the drive finds in itself.
 
         Args:
-            code: of the emergency message, which is also in 603Fh.
-            now_ns: when.
+            code: code of the emergency message, which is also in 603Fh.
+            now_ns: present time [ns].
             lasting: whether it is the power stage that fails: the motor coasts at once, and no reset helps until
                 `repaired`.
         """

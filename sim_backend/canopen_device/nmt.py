@@ -48,7 +48,7 @@ class Nmt:
 
     Attributes:
         state: the present one.
-        silent_nodes: whose heartbeats stay away.
+        silent_nodes: nodes whose heartbeats stay away.
         commanded: whether the last command, or else something of its own, brought it there.
     """
 
@@ -65,8 +65,8 @@ class Nmt:
         """Start as a node without power.
 
         Args:
-            node: whose state it is.
-            boot_ns: from a reset to the boot-up message [ns].
+            node: node whose state it is.
+            boot_ns: time from a reset to the boot-up message [ns].
             entered: called with the state before, after a change.
             reset: called when a reset has been asked for, before anything else happens.
             lost: called with a node whose heartbeat stays away.

@@ -13,8 +13,8 @@ class Node:
     """Hold the shared state of one node.
 
     Attributes:
-        number: its node id.
-        objects: its object dictionary.
+        number: node number.
+        objects: object dictionary of the node.
         now_ns: time of the event that is being handled [ns].
         out: frames to send, in order.
         timers: due times [ns], by name.

@@ -60,14 +60,14 @@ class Entry:
     """Describe one value of the dictionary.
 
     Attributes:
-        form: its struct format character; None for what is no number here.
+        form: struct format character; None for what is no number here.
         size: bytes; 0 for any number of them.
-        readable: by a host.
-        writable: by a host.
+        readable: whether a host may read it.
+        writable: whether a host may write it.
         mappable: into a PDO.
         low: least value, where the EDS says one.
         high: greatest value, where the EDS says one.
-        default: after power-up.
+        default: value after power-up.
     """
 
     form: str | None
@@ -84,8 +84,8 @@ class Objects:
     """Hold all values of one node.
 
     Attributes:
-        entries: by key.
-        values: by key; the firmware reads and writes here, past all rules.
+        entries: entries by key.
+        values: values by key; the firmware reads and writes here, past all rules.
         dummies: sizes [bytes] of the dummy objects by index (CiA 301, 7.4.7.1).
         before_read: called with the key before a host reads.
         veto: called with key and value before a host's write; raises SdoAbort to refuse.
@@ -97,7 +97,7 @@ class Objects:
 
         Args:
             text: of the file.
-            node: its number, for defaults that depend on it.
+            node: node number, for defaults that depend on it.
             own: numbers that entries have instead of what the file says, by key, cut off at what their types hold.
 
         Raises:

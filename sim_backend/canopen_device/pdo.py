@@ -49,8 +49,8 @@ class Layout:
     """Hold the byte layout of one PDO.
 
     Attributes:
-        packing: of all its bytes.
-        keys: of the objects, in order, without dummies.
+        packing: packing of all its bytes.
+        keys: keys of the objects, in order, without dummies.
     """
 
     packing: struct.Struct
@@ -61,7 +61,7 @@ def layout(objects: Objects, index: int, count: int | None = None) -> Layout:
     """Derive the layout from a mapping parameter.
 
     Args:
-        objects: that hold it.
+        objects: object dictionary that holds the mapping.
         index: of the mapping parameter.
         count: entries that count; by default as sub-index 0 says.
 
@@ -170,8 +170,8 @@ class Pdos:
         """Start with PDOs that do not exist yet.
 
         Args:
-            node: whose they are.
-            emergency: is told of wrong lengths and missed deadlines.
+            node: node of the PDOs.
+            emergency: errors of the node, to which wrong lengths and missed deadlines are added.
             received: called with the keys of objects that an RPDO has set.
             late: called when an RPDO has stayed away for longer than its event timer.
         """

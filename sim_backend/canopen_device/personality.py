@@ -37,7 +37,7 @@ class DriveProperties:
     """Describe the properties of one drive; the defaults are the shipped data sheet's.
 
     Attributes:
-        modes: of operation in which it follows a torque, as 6061h tells them.
+        modes: modes of operation in which it follows a torque, as 6061h tells them.
         target: key of the entry that takes the torque.
         shift: bits by which counts are shifted in it.
         needs: values of entries, by key, without which no torque follows the target.
@@ -115,7 +115,7 @@ def personality_of(text: str, drive: CanopenDrive, families: Sequence[Family] = 
     Args:
         text: of the EDS or DCF.
         drive: the section that describes it.
-        families: of the description, which count before the shipped ones.
+        families: families of the description, which take precedence over the shipped ones.
     """
     sheet = data_sheet(text)
     told = {name: sheet.identity[sub] for sub, name in ((1, "vendor"), (2, "product")) if sub in sheet.identity}

@@ -44,7 +44,7 @@ class Gears:
         """Take the gears from an arm's description.
 
         Args:
-            transmission: its section.
+            transmission: transmission section of the configuration.
             joints: of the arm.
 
         Raises:
@@ -88,7 +88,7 @@ class Gears:
         """Return motor dampings [N m s/rad] that brake no joint less than asked when all motors brake, shape (motors,).
 
         Args:
-            damping: asked for, per joint [N m s/rad or N s/m], shape (joints,).
+            damping: demanded damping per joint [N m s/rad or N s/m], shape (joints,).
         """
         squares = self.matrix**2
         needed = damping / squares.sum(axis=0)
@@ -114,7 +114,7 @@ class Body:
     Attributes:
         plant: body of the arm.
         gears: between motors and joints.
-        motors: in the order of the configuration.
+        motors: motors, in the order of the configuration.
         now_ns: the time that the plant has been moved to.
         watch: called after each step but the last of a longer silence, with the time.
         supported: whether the arm is still supported.

@@ -36,7 +36,7 @@ def build_emulator(config: ArmConfig, faults: Sequence[DriveFault] = ()) -> Emul
     """Build the drives that a configuration describes, on an arm at its home position and at rest, without power.
 
     Args:
-        config: its section `driver.emulation` says what the arm really is.
+        config: configuration whose section `driver.emulation` says what the arm really is.
         faults: to inject besides those of the configuration.
 
     Raises:

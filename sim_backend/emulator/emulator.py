@@ -132,8 +132,8 @@ class Emulator:
         """Process a frame that has come over a bus.
 
         Args:
-            bus: its index.
-            frame: of any kind.
+            bus: index of the bus.
+            frame: frame of any kind.
             now_ns: time of reception.
             sender: the drive that sent it, which does not hear it; None for the host.
             answer: given the answers to a SYNC before torques act, for a host that waits for them; None to have them

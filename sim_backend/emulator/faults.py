@@ -64,10 +64,10 @@ class DriveFault:
     Attributes:
         kind: a key of `DRIVE_FAULTS`.
         drive: index of the drive; None for all.
-        at: its beginning, from the moment it is counted from [s].
-        duration: how long [s]; None for one cycle or for good, as `DRIVE_FAULTS` says.
+        at: beginning of the fault, from the moment it is counted from [s].
+        duration: duration of the fault [s]; None for one cycle or for good, as `DRIVE_FAULTS` says.
         size: quantity that `DRIVE_FAULTS` defines.
-        offset: of a load, in the frame of the last link [m].
+        offset: offset of a load, in the frame of the last link [m].
     """
 
     kind: str
@@ -94,9 +94,9 @@ def configured(faults: Sequence[SimulatedFault], names: Sequence[str], period: f
     """Convert the faults of a configuration.
 
     Args:
-        faults: of the section `driver.emulation`.
+        faults: faults of the section `driver.emulation`.
         names: of the joints.
-        period: of the control loop [s], by which faults given by cycle are timed.
+        period: period of the control loop [s], by which faults given by cycle are timed.
 
     Raises:
         DriverError: a kind that drives on a bus cannot have, or a joint that the arm does not have.
@@ -203,8 +203,8 @@ class Sent:
     Attributes:
         bus: index of the bus.
         drive: index of the drive that sends it; None for what no drive sends.
-        frame: sent.
-        ready_ns: when its node wants to send it.
+        frame: frame to be sent.
+        ready_ns: time when its node wants to send it [ns].
     """
 
     bus: int
@@ -217,7 +217,7 @@ class Injection:
     """Hold the faults that act at present, and apply them.
 
     Attributes:
-        active: in the order in which they came.
+        active: active faults, in the order in which they came.
     """
 
     def __init__(self, body: Body, faces: Sequence[EmulatedDevice], buses: Sequence[int]) -> None:

@@ -108,7 +108,7 @@ class LockStepArm:
         """Build the arm and power it up.
 
         Args:
-            config: whose buses are all of this interface.
+            config: configuration whose buses are all of this interface.
             faults: to inject besides those of the configuration, counted from the first SYNC.
             clock: the loop's; by default a new one.
 
@@ -309,7 +309,7 @@ def from_config(config: ArmConfig, number: int) -> LockStepLink:
 
     Args:
         config: of the arm.
-        number: of the bus; the first one builds the arm, the others, opened after it, lead to the same one.
+        number: number of the bus; the first bus builds the arm, the others, opened after it, lead to the same arm.
 
     Raises:
         DriverError: as `LockStepArm`, or buses that are not opened in their order.

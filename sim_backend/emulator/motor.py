@@ -47,8 +47,8 @@ class Defects:
     Attributes:
         reversed: the torque acts the other way round.
         stuck: the power stage goes on doing what it does.
-        torque_share: of the largest torque, which is all the power stage can make.
-        torque_fraction: of the commanded torque, which is what the power stage makes; only measured torque shows it.
+        torque_share: share of the largest torque that the power stage can make.
+        torque_fraction: share of the commanded torque that the power stage makes; only measured torque shows it.
         frozen: the encoder repeats its last reading.
         mirrored: the encoder counts the wrong way.
         shift: counts added to the encoder's reading.
@@ -70,7 +70,7 @@ class Motor:
 
     Attributes:
         power: state of the power stage.
-        torque: that acts when `power` is TORQUE, at the motor [N m].
+        torque: torque at the motor that acts when `power` is TORQUE [N m].
         holds: whether the drive closes a position loop over the torque.
         braking: damping when `power` is BRAKE [N m s/rad]; a thousand times that when it is HELD.
         defects: of the motor.
@@ -92,9 +92,9 @@ class Motor:
         Args:
             rotor: of the arm.
             index: of the motor.
-            counts: of the encoder per turn.
+            counts: counts of the encoder per turn.
             scale: acting torque over commanded torque.
-            braking: with shorted windings [N m s/rad].
+            braking: damping with shorted windings [N m s/rad].
             relative: whether the encoder counts from where it was when power came, instead of from angle zero.
             unpowered: state of the power stage when it is off: COAST, BRAKE or HELD.
         """

@@ -49,7 +49,7 @@ class PythonCanBuses:
         """Open all buses.
 
         Args:
-            buses: as the arm's description names them.
+            buses: buses of the arm's description.
 
         Raises:
             DriverError: an interface that cannot be had; none stays open then.
@@ -175,7 +175,7 @@ class HostedBuses:
         """Open all wires.
 
         Args:
-            buses: as the arm's description names them.
+            buses: buses of the arm's description.
 
         Raises:
             DriverError: a wire that another process runs, or that cannot be had; none stays then.
@@ -261,11 +261,11 @@ class Emulated:
     """Summarise an emulation.
 
     Attributes:
-        seconds: its duration.
+        seconds: duration of the emulation [s].
         heard: frames received.
         sent: frames sent.
         unsent: frames that an interface did not take.
-        states: of the drives at the end, in words.
+        states: states of the drives at the end, in words.
         at_rest: whether the arm stood still.
     """
 
@@ -308,10 +308,10 @@ def emulate(
     Args:
         config: of the arm.
         faults: to inject besides those of the configuration, as people write them; they count from the first SYNC.
-        seconds: how long; None until asked to stop.
+        seconds: duration [s]; None until asked to stop.
         tell: called with a line whenever a drive changes its state, a fault comes or goes, or the arm comes to rest.
-        stop_requested: asked all the time.
-        commands: gives the next line of commands, None while there is none; never waits.
+        stop_requested: called all the time; True ends the emulation.
+        commands: function that returns the next line of commands, None while there is none; never waits.
 
     Returns:
         The summary.

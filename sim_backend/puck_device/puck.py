@@ -39,8 +39,8 @@ class EmulatedPuck:
     """Emulate one motor puck; see `EmulatedDevice`.
 
     Attributes:
-        motor: that it drives.
-        values: of its properties, by name; tests may change them.
+        motor: motor that it drives.
+        values: values of its properties, by name; tests may change them.
     """
 
     def __init__(
@@ -57,14 +57,14 @@ class EmulatedPuck:
         """Assemble a puck without power.
 
         Args:
-            puck: its section of the description.
-            motor: that it drives.
+            puck: section of the description for the puck.
+            motor: motor that it drives.
             safety: the arm's safety puck.
             version: of its firmware.
-            ipnm: counts per N m that it has, where the description says something else.
+            ipnm: true counts per N m, where the description says something else.
             origin: position that the motor has at first in an arm that has been zeroed [counts]; None for one that has
                 not, and whose pucks have just been switched on.
-            joint: gives the joint encoder's counts at a time [ns]; None where it reads none.
+            joint: function that returns the joint encoder's counts at a time [ns]; None where the puck reads none.
         """
         self.motor = motor
         self._node, self._safety = puck.node, safety

@@ -44,10 +44,10 @@ class EmulatedSafetyPuck:
     """Emulate the safety puck of one arm.
 
     Attributes:
-        number: its node.
+        number: node number.
         mode: MODE.
         lowered_by_host: whether the host has asked for IDLE since the arm was active.
-        ignores_heartbeat: whether it goes on although nobody talks to the pucks.
+        ignores_heartbeat: whether the puck goes on although nobody talks to the pucks.
     """
 
     def __init__(
@@ -64,13 +64,13 @@ class EmulatedSafetyPuck:
         """Assemble a safety puck without power.
 
         Args:
-            number: its node.
+            number: node number.
             version: of its firmware.
-            points: gives joint positions [rad or m] and points of the arm [m] for motor positions [counts].
+            points: function from motor positions [counts] to joint positions [rad or m] and points of the arm [m].
             heartbeat: time without positions and torques after which it leaves ACTIVE [s].
-            operator: after how long torque frames make a person press Shift-Activate [s]; None for nobody.
+            operator: time of torque frames after which a person presses Shift-Activate [s]; None for nobody.
             zeroed: whether the arm has been zeroed before.
-            velocity: at which it trips, whatever it was told [m/s]; None for what it was told.
+            velocity: speed at which it trips, whatever limit it was told [m/s]; None for the limit that it was told.
         """
         self.number = number
         self.mode = SafetyMode.IDLE

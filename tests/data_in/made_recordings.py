@@ -37,7 +37,7 @@ class MadeRecording:
         self.block = Block(np.array(stamp_ns, np.int64), position.copy(), torque.copy(), own)
         self.joints = position.shape[1]
         self.joint_names = tuple(f"j{k}" for k in range(self.joints))
-        self.torque_held = held
+        self.torque_zero_order_hold = held
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
         return assemble([self.block], samples, self.path, self.joint_names)

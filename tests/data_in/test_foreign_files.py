@@ -67,7 +67,7 @@ def test_a_bag_with_other_names_and_order(tmp_path: Path, samples: Block, joints
     recording = open_recording(path, joints, fmt=form)
     order = [("two", "one").index(joint) for joint in joints]
     assert recording.joint_names == joints
-    assert not recording.torque_held
+    assert not recording.torque_zero_order_hold
     assert np.array_equal(whole(recording).position, samples.position[:, order])
     assert np.array_equal(whole(recording).torque, samples.torque[:, order])
 

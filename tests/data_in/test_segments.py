@@ -225,7 +225,7 @@ class Endless:
     sha256 = "0" * 64
     joint_names = ("a",)
     joints = 1
-    torque_held = False
+    torque_zero_order_hold = False
     torn = False
 
     def __init__(self, blocks: int, regular: bool) -> None:

@@ -30,7 +30,7 @@ class SampledRecording:
     path: Path = Path("synthetic.csv")
     sha256: str = "0" * 64
     joint_names: tuple[str, ...] = ()
-    torque_held: bool = False
+    torque_zero_order_hold: bool = False
     torn: bool = False
     velocity: Array | None = None
 

@@ -24,7 +24,7 @@ def noisy(samples: int, *, held: bool = False, seed: int = 3) -> SampledRecordin
     rng = np.random.default_rng(seed)
     time = np.arange(samples) / RATE
     position = waves(seed, 3).derivative(time, 0) + 1e-4 * rng.normal(size=(samples, 3))
-    return SampledRecording(stamps(samples, RATE), position, rng.normal(size=(samples, 3)), torque_held=held)
+    return SampledRecording(stamps(samples, RATE), position, rng.normal(size=(samples, 3)), torque_zero_order_hold=held)
 
 
 def in_one_piece(recording: SampledRecording, options: Identification) -> Motion:
@@ -43,7 +43,7 @@ def in_one_piece(recording: SampledRecording, options: Identification) -> Motion
     q = low_pass(recording.position)
     dq = difference(q)
     torque = recording.torque.copy()
-    if recording.torque_held:
+    if recording.torque_zero_order_hold:
         torque[1:] = 0.5 * (recording.torque[1:] + recording.torque[:-1])
     if options.smoothing.filter_torque:
         torque = low_pass(torque)

@@ -84,7 +84,7 @@ def test_velocities_that_lag_are_not_chosen() -> None:
 
 
 def test_velocities_of_our_own_loop_are_not_required() -> None:
-    assert identified("choose", replace(noisy(*arm()), torque_held=True)).choices == ()
+    assert identified("choose", replace(noisy(*arm()), torque_zero_order_hold=True)).choices == ()
 
 
 def test_a_validation_without_velocities_is_judged_all_the_same() -> None:

@@ -85,7 +85,7 @@ def test_noise_is_estimated_from_what_differs(periods: int) -> None:
 
 
 def test_a_held_torque_stands_between_its_samples() -> None:
-    held = replace(run(2 * LENGTH), torque_held=True)
+    held = replace(run(2 * LENGTH), torque_zero_order_hold=True)
     torque = run(LENGTH).torque
     got = averaged(held, OPTIONS, PERIOD).motion
     np.testing.assert_allclose(got.torque, 0.5 * (torque + np.roll(torque, 1, axis=0)), rtol=0, atol=1e-9)

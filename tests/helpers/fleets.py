@@ -147,7 +147,7 @@ class DrawnRecording:
     """Recording that is no file: the samples that `write_recording` would write, for campaigns over many fleets."""
 
     joint_names: tuple[str, ...]
-    torque_held, torn = True, False
+    torque_zero_order_hold, torn = True, False
 
     def __init__(self, of: Kind, delta: Array, *, seed: int, seconds: float | None = None) -> None:
         self.path = Path(f"{seed}.drawn")

@@ -17,7 +17,7 @@ from ident_service.config.motion_limits import MotionLimits
 from ident_service.errors import ArmFault, MotionRefused
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
-from ident_service.motion.clearance import ClearanceChecker, require_clear, stops_touching
+from ident_service.motion.clearance import ClearanceChecker, require_clear, trajectory_stop_contact
 from ident_service.motion.run import run
 from ident_service.motion.sequencer import Paused, Resumed
 from ident_service.motion.trajectory import PathReference, Reference, Setpoint, plan_trajectory, rest, run_to_end
@@ -134,10 +134,10 @@ def test_a_stop_out_of_a_trajectory_that_would_touch_is_reported() -> None:
     ahead = tip(np.array([0.2, 0.0])) + np.array([0.0, 0.03, 0.0])
     collision = CollisionModel(with_ball(ahead, 0.01))
     assert collision.distances(np.zeros((1, 2))).min() > 0.1
-    told = run_to_end(stops_touching(collision, Standing(moving), LIMITS))
+    told = run_to_end(trajectory_stop_contact(collision, Standing(moving), LIMITS))
     assert told is not None
     assert told.startswith("a stop out of the trajectory at 0.00 s would touch: elbow - obstacle ball, -0.")
-    assert run_to_end(stops_touching(collision, Standing(rest(np.zeros(2))), LIMITS)) is None
+    assert run_to_end(trajectory_stop_contact(collision, Standing(rest(np.zeros(2))), LIMITS)) is None
 
 
 def test_a_run_is_refused_for_a_stop_out_of_its_approach_too() -> None:

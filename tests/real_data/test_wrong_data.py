@@ -44,7 +44,7 @@ class Changed:
 
     def __post_init__(self) -> None:
         self.path, self.joints, self.joint_names = self.behind.path, self.behind.joints, self.behind.joint_names
-        self.torque_held, self.torn = self.behind.torque_held, False
+        self.torque_zero_order_hold, self.torn = self.behind.torque_zero_order_hold, False
         self.sha256 = self.behind.sha256
 
     def blocks(self, samples: int = 1 << 30) -> Iterator[Block]:

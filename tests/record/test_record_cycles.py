@@ -102,7 +102,7 @@ class Counted:
     """A recording that knows how often it was read."""
 
     path, sha256, joint_names, joints = Path("x.csv"), "0" * 64, ("a",), 1
-    torque_held = torn = False
+    torque_zero_order_hold = torn = False
 
     def __init__(self) -> None:
         self.readings = 0
@@ -157,6 +157,6 @@ def test_a_kept_file_is_the_file(tmp_path: Path) -> None:
     write(tmp_path / "run.mcap", 50)
     whole = open_recording(tmp_path / "run.mcap", JOINTS)
     kept = CachedRecording(whole)
-    assert (kept.path, kept.sha256, kept.joints, kept.torn, kept.torque_held) == (
-        *(whole.path, whole.sha256, whole.joints, whole.torn, whole.torque_held),
+    assert (kept.path, kept.sha256, kept.joints, kept.torn, kept.torque_zero_order_hold) == (
+        *(whole.path, whole.sha256, whole.joints, whole.torn, whole.torque_zero_order_hold),
     )

@@ -55,7 +55,7 @@ def test_a_killed_process_loses_less_than_200_ms(tmp_path: Path) -> None:
     recording = McapRecording(tmp_path / "run.mcap.partial")
     block = read_all(recording)
     assert recording.torn
-    assert recording.torque_held
+    assert recording.torque_zero_order_hold
     assert recording.metadata["complete"] == "false"
     assert np.array_equal(block.position, [position(k, 3) for k in range(len(block.stamp_ns))])
     assert START_NS + (count - 1) * STEP_NS - block.stamp_ns[-1] <= 200_000_000

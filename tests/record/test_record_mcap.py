@@ -46,7 +46,7 @@ def test_round_trip(tmp_path: Path, velocity: bool, samples: int) -> None:
     block = read_all(recording, samples)
     expected = np.array([position(k, 3) for k in range(500)])
     assert recording.joint_names == JOINTS
-    assert recording.torque_held
+    assert recording.torque_zero_order_hold
     assert not recording.torn
     assert np.array_equal(block.stamp_ns, START_NS + STEP_NS * np.arange(500))
     assert np.array_equal(block.position, expected)
@@ -220,7 +220,7 @@ def test_bags_of_others(tmp_path: Path, compression: CompressionType, chunk_size
                 writer.write_message("/joint_states", schema, {"velocity": [], "effort": [], **message}, k * 10**6)
         writer.finish()
     recording = open_recording(path, ["a", "b"])
-    assert not recording.torque_held
+    assert not recording.torque_zero_order_hold
     for samples in (7, 1000):
         block = read_all(recording, samples)
         assert np.array_equal(block.stamp_ns, np.arange(1, 201) * 10**6)

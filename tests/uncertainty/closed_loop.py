@@ -42,4 +42,4 @@ def recorded_in_closed_loop(
         alpha = acceleration[k] + 20.0 * (rate[k] - velocity) + 100.0 * (wanted[k] - seen[k])
         torque[k] = plant.inverse_dynamics(seen[k], velocity, alpha)
         plant.step(torque[k])
-    return SampledRecording(stamps(len(time), RATE), seen, torque, torque_held=True)
+    return SampledRecording(stamps(len(time), RATE), seen, torque, torque_zero_order_hold=True)

@@ -139,7 +139,7 @@ def test_the_simulated_arm_follows_and_keeps_everything_else() -> None:
     np.testing.assert_array_equal(np.concatenate([block.torque for block in blocks]), recording.torque)
     np.testing.assert_array_equal(np.concatenate([block.stamp_ns for block in blocks]), recording.stamp_ns)
     assert made.sha256 == recording.sha256
-    assert made.torque_held
+    assert made.torque_zero_order_hold
     # The encoder's noise is nowhere in it.
     assert np.sqrt(np.mean((position - recording.position) ** 2)) > 4e-3
     assert np.abs(np.diff(position, 3, axis=0)).max() < 2e-3
@@ -155,7 +155,7 @@ def test_a_gap_is_not_simulated_across() -> None:
     made = simulated(moved, model, truth, 8.0)
     (block,) = made.blocks(len(late))
     before = (values[:half] for values in (recording.stamp_ns, recording.position, recording.torque))
-    first = simulated(SampledRecording(*before, torque_held=True), model, truth, 8.0)
+    first = simulated(SampledRecording(*before, torque_zero_order_hold=True), model, truth, 8.0)
     np.testing.assert_allclose(block.position[:half], next(iter(first.blocks(half))).position, rtol=0, atol=1e-12)
     assert np.abs(block.position - moved.position).max() < 2e-3
 

@@ -69,11 +69,11 @@ class Command:
     """Command that a job's process runs.
 
     Attributes:
-        words: after `ident`.
+        words: words of the command after `ident`.
         arm: name, None where it is about none.
         moves: whether an arm may get a torque, or another zero.
         run: id of the folder that is made, or that it is about; None for a preflight.
-        resources: that it has for itself while it runs; none for one that only computes.
+        resources: resources that it has for itself while it runs; none for a command that only computes.
         lease: how long its motion goes on after a renewal [s].
         waits: whether it may wait for its resources; what a person says of an arm as it stands now may not.
     """
@@ -260,7 +260,7 @@ def _options(request: asked.AnyJobRequest, **others: str) -> list[str]:
     """Return a request's values as options, each in one word, so that no value can pass for an option.
 
     Args:
-        request: whose fields of `_OPTIONS` have the options of their names.
+        request: request whose fields named in `_OPTIONS` become options.
         others: options of further fields, or of the same.
     """
     words = list[str]()

@@ -44,8 +44,8 @@ class Outcome:
 
     Attributes:
         state: one of those in `registry/jobs.py`.
-        detail: why, in words; empty where there is nothing to say.
-        exit_code: of the command, None without one.
+        detail: reason for the state, in words; empty where there is nothing to say.
+        exit_code: exit code of the command, None without one.
     """
 
     state: str
@@ -58,8 +58,8 @@ class ProcessOutput:
     """Output of a job's process, from its files.
 
     Attributes:
-        answer: its one JSON object; empty where it had none.
-        text: what a person would have read at its terminal.
+        answer: the one JSON object of its output; empty where it had none.
+        text: text that a person would have read at its terminal.
         log: the end of its output, without samples (`printed_samples`).
     """
 
@@ -110,8 +110,8 @@ def outcome(output: ProcessOutput, exit_code: int | None, end_reason: str) -> Ou
 
     Args:
         output: of the process.
-        exit_code: as its parent saw it, None where it had another one.
-        end_reason: why it was asked to end; empty if it was not.
+        exit_code: exit code that the process's parent saw; None where the process had another parent.
+        end_reason: reason why the process was asked to end; empty if it was not.
     """
     code = output.answer.get("exit_code")
     if not isinstance(code, int):
@@ -135,7 +135,7 @@ def interrupted(output: ProcessOutput, folder: Path | None, *, moves: bool) -> s
 
     Args:
         output: output of its process so far.
-        folder: that it made, if any.
+        folder: folder of the job's output, if it has made one.
         moves: whether it is about a motion.
     """
     words = ["the service died while it ran"]
@@ -206,7 +206,7 @@ def register_outputs(db: Database, state: Path, row: Row, by: str) -> None:
         db: the registry.
         state: the state folder.
         row: of the job.
-        by: who asked for it.
+        by: name of the requester.
 
     Raises:
         IdentError: the folder is not what its manifest names, or not one of a run.
@@ -276,9 +276,9 @@ class Orphan:
 
     Attributes:
         row: of its job.
-        process: its name, as `child_process.alive` takes it.
+        process: name of the process, as `child_process.alive` takes it.
         controlling_pid: id of the process that has the arm; None before one was seen.
-        since: when it was seen first [s].
+        since: time when the process was first seen [s].
     """
 
     row: Row
@@ -337,7 +337,7 @@ def explain_interrupted(
         state: the state folder.
         found: them, as `orphans` returned them; looked for here if None.
         over: called with the id of each job whose process has ended.
-        closing: ends this early; the next service goes on.
+        closing: event that ends this early; the next service goes on.
     """
     left = list(orphans(db, state) if found is None else found)
     closing = threading.Event() if closing is None else closing

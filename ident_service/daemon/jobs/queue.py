@@ -64,8 +64,8 @@ class Progress:
     """Progress of a job.
 
     Attributes:
-        phase: its last words.
-        fraction: from 0 to 1; None where it cannot be known.
+        phase: last words of the job.
+        fraction: share that is done, from 0 to 1; None where it cannot be known.
         remaining: time to the end [s]; None where it cannot be known.
     """
 
@@ -79,8 +79,8 @@ def progress(log: str, elapsed: float, typical: float | None) -> Progress:
 
     Args:
         log: output of the job, its last lines at least.
-        elapsed: since it began [s].
-        typical: what such jobs took [s]; None before there was one.
+        elapsed: time since the job began [s].
+        typical: usual duration of such jobs [s]; None before there was one.
     """
     said = (line.strip() for line in log.splitlines())
     lines = [line for line in said if line and not line.startswith("next: ")]  # a hint at the end is no phase
@@ -109,23 +109,23 @@ class LiveJob:
     """Job that waits or runs, with the state that only this process knows.
 
     Attributes:
-        job: its id.
+        job: id of the job.
         order: the command of its process.
-        by: who asked for it.
+        by: name of the requester.
         own_lease: whether a motion's lease is the service's own.
-        renewed: when that was renewed last [s].
-        requested_ns: when it was asked for, on the machine's monotonic clock, which stops at terminals tell, too [ns].
-        requested: the same on the leases' clock [s]; a motion was confirmed just before.
+        renewed: time of the lease's last renewal [s].
+        requested_ns: time of the request on the machine's monotonic clock [ns], which stops at terminals use, too.
+        requested: time of the request on the leases' clock [s]; a motion was confirmed just before.
         entered: whether the registry knows it; before, it keeps its place and nothing else.
-        child: its process, once it runs.
-        end_reason: why it is to end; empty while it is not.
-        end_state: its state afterwards, if it has not begun.
-        since: when that was asked [s].
+        child: process of the job, once it runs.
+        end_reason: reason why it is to end; empty while it is not.
+        end_state: state of the job afterwards, if it has not begun.
+        since: time when it was asked to end [s].
         terminated: whether a computation was sent SIGTERM.
         killed: whether it was ended by force.
         concluding: whether its end is being entered.
         unentered: how it ended and why the registry cannot take that yet; empty where nothing is in the way.
-        exit_code: with which its process has ended, as far as it is known.
+        exit_code: exit code of its process, as far as it is known.
     """
 
     job: str
@@ -158,7 +158,7 @@ class LiveJobs:
         Args:
             lease_factor: how much longer than usual the service waits for a renewal, and a motion for its turn.
             now: the leases' clock [s].
-            renewed: hears how old a lease was that is renewed [s]; does not wait.
+            renewed: called with the age of a lease at its renewal [s]; must not wait.
         """
         self._renewed = renewed
         self.changed = threading.Event()
@@ -428,7 +428,7 @@ class Engine:
             lease_factor: how much longer than usual the service waits for a renewal before it tells the motion's
                 process to stop, which counts by itself, and a motion for its turn; for tests on machines that stall.
             now: the leases' clock [s].
-            metrics: that count jobs and leases; figures of its own if None.
+            metrics: counters of jobs and leases; figures of its own if None.
         """
         self.metrics = Metrics() if metrics is None else metrics
         self.db, self.state, self.audit = db, state, AuditQueue(db)
@@ -446,7 +446,7 @@ class Engine:
         """Mark the jobs that were interrupted, then begin to run the queue; returns at once.
 
         Args:
-            first: done by the queue's thread before it begins anything.
+            first: function that the queue's thread calls before it begins anything.
         """
         self._first = first
         mark_interrupted(self.db, self.state)
@@ -480,11 +480,12 @@ class Engine:
         """Queue a job.
 
         Args:
-            asked: by ids.
+            asked: request of the job, its objects named by id.
             by: the name of a token, or `service`.
             own_lease: whether a motion's lease is the service's own, as a scheduled one's is.
-            stops: what `live.stops` answered when a person, or the schedule, began that of which this is a later step.
-            entering: writes what belongs to the job in the same transaction.
+            stops: value of `live.stops` when a person, or the schedule, began the work of which this job is a later
+                step.
+            entering: function that writes what belongs to the job, in the same transaction.
 
         Raises:
             UsageError: it names what is not known.

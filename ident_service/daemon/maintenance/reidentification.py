@@ -82,7 +82,7 @@ def conclude(db: Database, row: Row, verdict: Verdict, now: float) -> None:
     Args:
         db: the registry.
         row: of the re-identification.
-        verdict: what the comparison says.
+        verdict: verdict of the comparison.
         now: s since 1970 in UTC.
     """
     with db.transaction():
@@ -105,10 +105,10 @@ def enter_concluded(
         against: number of the acceptance.
         recorded: id of the run with the recording.
         run: id of the run with the parameters.
-        verdict: what the comparison says.
+        verdict: verdict of the comparison.
         begun: s since 1970 in UTC.
-        by: who did it.
-        now: likewise.
+        by: name of the person who did it.
+        now: s since 1970 in UTC.
     """
     name = new_id(arm)
     with db.transaction():
@@ -145,7 +145,7 @@ class Reidentifications:
         """Create the table without re-identifications.
 
         Args:
-            engine: does the jobs.
+            engine: engine that runs the jobs.
             now: s since 1970 in UTC.
         """
         self._engine, self._db, self._state, self._now = engine, engine.db, engine.state, now

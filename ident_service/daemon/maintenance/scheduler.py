@@ -38,8 +38,8 @@ class MaintenanceScheduler:
         """Create the scheduler; nothing is checked before `start`.
 
         Args:
-            engine: does the jobs.
-            webhook: is told; nobody is if None.
+            engine: engine that runs the jobs.
+            webhook: webhook that notices are sent by; None for no notices.
             now: s since 1970 in UTC.
         """
         self.reidentifications = Reidentifications(engine, now)

@@ -60,9 +60,9 @@ class Webhook:
 
         Args:
             db: the registry.
-            url: https, or http to a loopback address.
-            secret: shared with the receiver, 16 bytes or more.
-            waits: after each attempt that failed but the last [s].
+            url: URL of the receiver: https, or http to a loopback address.
+            secret: secret shared with the receiver, 16 bytes or more.
+            waits: waiting times after failed attempts [s]; after one more failure the notice is given up.
             now: s since 1970 in UTC.
 
         Raises:
@@ -82,7 +82,7 @@ class Webhook:
 
         Args:
             kind: `arm.due` and so on.
-            at: when it happened [s since 1970 in UTC].
+            at: time of the event [s since 1970 in UTC].
             data: JSON values.
 
         Returns:

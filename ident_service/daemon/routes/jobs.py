@@ -266,7 +266,7 @@ def without_paths(value: Any, state: str, named: Mapping[str, str] = NOTHING) ->
     Args:
         value: JSON values.
         state: the folder.
-        named: what other places are called.
+        named: texts that replace other paths, by path.
     """
     if isinstance(value, str):
         for place, name in named.items():

@@ -35,8 +35,8 @@ class ArmFacts:
 
     Attributes:
         kind: `recordings` for an arm without a driver, which cannot be moved from here.
-        driver: its kind, for a real arm; empty for others.
-        joints: how many; 0 where the description does not list them.
+        driver: kind of the driver of a real arm; empty for others.
+        joints: number of joints; 0 where the description does not list them.
         description: the description's own words.
     """
 

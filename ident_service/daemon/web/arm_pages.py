@@ -101,7 +101,7 @@ class CommissioningWorkflow:
     """All commissioning steps of an arm, and what they are about.
 
     Attributes:
-        steps: in order.
+        steps: steps, in order.
         run: id of the newest run on the arm that came to its end; of an arm with recordings only, its newest recording.
         identified: id of the newest identification of that run.
         accepted: the current acceptance.

@@ -75,9 +75,9 @@ class Compared:
     """Comparison that a verdict was concluded from.
 
     Attributes:
-        folder: of the run that keeps it.
-        findings: what has changed: `what` and of which joint or link; `joint`, whose torque changes most for its size;
-            `sigma`, the change in standard deviations; `size`, in words; `meaning`. Joint and size may be empty.
+        folder: folder of the run that keeps the comparison.
+        findings: changes: `what` and of which joint or link; `joint`, whose torque changes most for its size; `sigma`,
+            the change in standard deviations; `size`, in words; `meaning`. Joint and size may be empty.
         errors: torque error on the new recording with the accepted parameters and with its own [%]; None if unknown.
     """
 
@@ -110,7 +110,7 @@ def compared(db: Database, state: Path, run: str | None, words: str) -> Compared
         db: the registry.
         state: the state folder.
         run: id of the run with the parameters.
-        words: what was concluded, as the registry has it.
+        words: words of the conclusion, as the registry has them.
     """
     try:
         named = {} if run is None else runs.run_files(db, state, run)

@@ -44,14 +44,14 @@ class IdentifiedSet:
     """Parameters that a run holds, as pages show them.
 
     Attributes:
-        word: what they are good for: `use`, `use with care` or `do not use`.
+        word: verdict on the use of the parameters: `use`, `use with care` or `do not use`.
         line: the verdict in one sentence, after that word.
         reasons: the most important ones.
         further: the others.
         joints: a row per joint, the worst first (`results/assessment.py`).
         expressions: base parameters.
-        units: theirs.
-        values: theirs.
+        units: units of the base parameters.
+        values: values of the base parameters.
         deviations: standard deviations; None where unknown.
         verdicts: `identified`, `weak` or `unidentified`, of each.
     """
@@ -117,11 +117,11 @@ class RunFacts:
 
     Attributes:
         motion: name of the motion; empty where the run does not say.
-        length: of the motion at its own speed [s]; None where unknown.
-        speed: share of it; None where unknown.
+        length: length of the motion at its own speed [s]; None where unknown.
+        speed: share of the motion's own speed; None where unknown.
         driven: how long the control loop drove the arm [s]; None where unknown.
         ended: report of its end (`motion/ending.py`), or `{"error": ...}`; empty for one that was killed or uploaded.
-        joints: with units and limits (`JointFacts`) and the peaks of the run: `peak_error` and `peak_torque`.
+        joints: joints, with units and limits (`JointFacts`) and the peaks of the run: `peak_error` and `peak_torque`.
         recording: name of the recording that can be drawn; None where there is none.
     """
 

@@ -52,7 +52,7 @@ class ChangeEllipsoid:
     Attributes:
         origin: base parameters that they move from [SI], shape (base,).
         metric: N above, shape (rows, base).
-        moves: which base parameters may move, shape (base,).
+        moves: mask of the base parameters that may move, shape (base,).
     """
 
     origin: Array
@@ -70,7 +70,7 @@ class _Matrices:
 
     Attributes:
         values: shape (matrices, size, size).
-        slopes: their derivatives along the directions, shape (matrices, size, size, directions).
+        slopes: derivatives of the values along the directions, shape (matrices, size, size, directions).
         bounded: 1 where the trace is part of f, as that of a link's inertia is, else 0, shape (matrices,).
     """
 
@@ -149,7 +149,7 @@ def _least_squares(J: Array, r: Array) -> Array:
     """Return the x that minimises |J x - r|, the smallest one where several do.
 
     Args:
-        J: its columns have unit length, or none, shape (rows, unknowns).
+        J: matrix whose columns have unit length, or none, shape (rows, unknowns).
         r: shape (rows,).
     """
     from scipy.linalg.lapack import dgelsy, dgelsy_lwork, dtrtrs  # alone: all of scipy.linalg loads for 0.2 s

@@ -60,7 +60,7 @@ class ScaledProblem:
         origin: x0.
         columns: C, a matrix or its diagonal.
         maps: per constraint M, a matrix or its diagonal.
-        scale: what the objective was divided by.
+        scale: divisor of the objective.
     """
 
     rows: list[Rows]
@@ -180,11 +180,11 @@ class Solution:
         x: the variables, shape (variables,).
         duals: per constraint in the order they were added, its multiplier; matrices by upper triangle as above.
         objective: value of the objective.
-        iterations: of the interior-point method, over all attempts.
-        seconds: inside the solver, over all attempts.
-        tolerance: of gap and feasibility, relative, that the solver was asked for and reached.
+        iterations: iterations of the interior-point method, over all attempts.
+        seconds: time inside the solver [s], over all attempts.
+        tolerance: relative tolerance of gap and feasibility that the solver was asked for and reached.
         attempts: how many times the problem was posed, 1 unless the solver stopped early.
-        bound: of each link's tr(P) [kg] that the problem was posed with, see `formulation.py`.
+        bound: upper bound of each link's tr(P) [kg] in the posed problem, see `formulation.py`.
     """
 
     x: Array
@@ -263,7 +263,7 @@ class ConicProblem:
 
         Args:
             objective: linear coefficients, shape (variables,).
-            name: what to call the problem in an error.
+            name: name of the problem, for errors.
             quadratic: non-negative diagonal of the Hessian, shape (variables,); the objective is
                 `objective^T x + x^T diag(quadratic) x / 2`.
             enough: tolerance that is enough, of a problem that is posed once; None for nine digits, in any pose.

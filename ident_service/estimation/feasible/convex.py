@@ -64,7 +64,7 @@ class ConvexEstimate:
 
     Attributes:
         estimate: the parameters.
-        solver: that found them, lower case.
+        solver: name of the solver, lower case.
         status: cvxpy's word: `optimal`, or `optimal_inaccurate` where the solver stopped early.
     """
 
@@ -117,10 +117,10 @@ def convex_least_squares(
         fit: the unconstrained least squares.
         base: grouping of the parameters.
         conditions: the feasible set.
-        prior: what the estimate is drawn to.
+        prior: prior that the estimate is drawn to; None for none.
         custom: the user's constraints and penalty.
         solver: any that `available_solvers` names.
-        bound: of each link's tr(P) [kg]; those of `formulation.py` in turn when None, none with a prior.
+        bound: upper bound of each link's tr(P) [kg]; those of `formulation.py` in turn when None, none with a prior.
         inside: whether the parameters must have a positive margin; a solver of first order may miss the inset of 1e-6.
 
     Raises:
@@ -173,7 +173,7 @@ def objective(fit: LeastSquares, found: FeasibleEstimate, prior: Prior | None) -
     Args:
         fit: the unconstrained least squares.
         found: the estimate.
-        prior: that it was drawn to.
+        prior: prior that the estimate is drawn to; None for none.
 
     Raises:
         ParameterError: the residual has no variance.
@@ -325,13 +325,15 @@ class SecondOpinion:
     """Comparison of two solutions of one problem.
 
     Attributes:
-        solvers: of the first and of the second solution; the first is `ident` where the problem was not posed in cvxpy.
+        solvers: names of the solvers of the first and of the second solution; the first is `ident` where the problem
+            was not posed in cvxpy.
         status: cvxpy's word for the second.
-        objectives: of both: |R_1 beta - rho_1|, or with a prior or a penalty the whole sum that is minimised.
+        objectives: objectives of both solutions: |R_1 beta - rho_1|, or with a prior or a penalty the whole sum that is
+            minimised.
         torque_percent: |R_1 (beta_2 - beta_1)| of |rho_1|, in percent: how far the predicted torques are apart.
         deviations: the largest difference of a base parameter, in its standard deviations.
-        expression: of that parameter.
-        margin: of the second solution in the set; where it is negative, the solver missed the set by so much.
+        expression: expression of the base parameter with that difference.
+        margin: margin of the second solution in the set; where it is negative, the solver missed the set by so much.
     """
 
     solvers: tuple[str, str]
@@ -372,7 +374,7 @@ def second_opinion(
         base: grouping of the parameters.
         conditions: the feasible set.
         deviations: standard deviations of the base parameters, shape (base,).
-        prior: what both are drawn to.
+        prior: prior that both estimates are drawn to; None for none.
         custom: the user's constraints and penalty, in both.
         solver: without `custom`, that of the second solution; with it, that of the first, and the second is another.
 

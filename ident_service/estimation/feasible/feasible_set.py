@@ -318,9 +318,9 @@ class FeasibleSet:
     """All conditions on delta, whose entries are in the order of `names`.
 
     Attributes:
-        kind: which condition on inertias.
+        kind: condition on the inertias.
         names: link parameters.
-        blocks: what must be positive.
+        blocks: matrices or lists of numbers that must be positive.
         equalities: lists of numbers that must be zero.
     """
 
@@ -375,9 +375,9 @@ def feasible_set(
     """Return the feasible set of an arm, or of a bare table of parameters.
 
     Args:
-        kind: which condition on inertias.
+        kind: condition on the inertias.
         names: link parameters in the order of delta; every link has all ten of eq. 13.
-        config: where mass, centre-of-mass and sign conditions come from; none of them without it.
+        config: description with the mass, centre-of-mass and sign conditions; none of these when None.
         positive: joint terms that must be positive where there is no configuration.
 
     Raises:

@@ -96,12 +96,12 @@ def minimise(
     """Solve within the first bound on the links' tr(P) (a reach) that has an acceptable optimum.
 
     Args:
-        problem: constraints gathered.
+        problem: problem with all its constraints.
         objective: linear coefficients, shape (variables,).
         name: of the problem, for errors.
         to_delta: T and d with delta = T x + d.
-        conditions: whose links to bound.
-        size: of the largest base parameter, which a reach must not cut off.
+        conditions: feasible set whose links are bounded.
+        size: size of the largest base parameter, which a reach must not cut off.
         quadratic: diagonal of the Hessian, shape (variables,).
         accept: whether an optimum is accurate enough to be used.
         reaches: bounds of tr(P) to try, in turn.
@@ -140,7 +140,7 @@ def largest(conditions: FeasibleSet, size: float) -> float:
     """Return the largest base parameter or bound, at least 1, which a reach is multiplied by.
 
     Args:
-        conditions: whose bounds.
+        conditions: feasible set with the bounds.
         size: of the largest base parameter.
     """
     numbers = (np.abs(block.f).max(initial=0.0) for block in conditions.blocks)

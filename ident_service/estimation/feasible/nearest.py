@@ -47,7 +47,7 @@ class FeasibleEstimate:
         iterations: of the solver.
         solver_seconds: inside the solver.
         prior_distance: divergence from the prior, before its weight; 0 without one.
-        bound: of each link's tr(P) [kg] within which it was sought, see `formulation.py`; infinite for none.
+        bound: upper bound of each link's tr(P) [kg] in the search, see `formulation.py`; infinite for none.
         penalty: value of the penalty of `constraints.custom`; None without one.
     """
 
@@ -98,7 +98,7 @@ def solve_inside(
     """Solve a problem whose answer must lie inside the set.
 
     Args:
-        problem: constraints gathered, those of the set included.
+        problem: problem with all its constraints, those of the set included.
         objective: linear coefficients, shape (variables,).
         name: of the problem, for errors.
         to_delta: delta = to_delta x.
@@ -154,7 +154,7 @@ def nearest(
     Args:
         metric: shape (rows, base).
         target: shape (rows,).
-        beta: what the unconstrained answer is about, shape (base,).
+        beta: unconstrained base parameters, shape (base,).
         base: grouping of the parameters.
         conditions: the set.
         name: of the problem, for errors.

@@ -44,8 +44,8 @@ class Prior:
     Attributes:
         kind: of divergence.
         names: link parameters.
-        delta: their values [SI], shape (parameters,).
-        weight: of one unit of divergence against one residual variance; 0 for none.
+        delta: prior values of the link parameters [SI], shape (parameters,).
+        weight: weight of one unit of divergence, in residual variances; 0 for none.
         sigma: standard deviation of the residual [N m or N]; that of the fit when None.
     """
 
@@ -191,7 +191,7 @@ def move_off_boundary(
         held: constrained least squares, pressed against the set.
         base: grouping of the parameters.
         conditions: the set.
-        likely: bodies to be drawn to.
+        likely: bodies that the estimate is drawn to.
         near: how far base parameters may move.
 
     Returns:
@@ -289,7 +289,7 @@ def choose_weight(
 
     Args:
         fit_for_weight: base parameters for a weight, shape (base,).
-        score: of base parameters on held-out recordings, smaller is better.
+        score: function that scores base parameters on held-out recordings; smaller is better.
         grid: weights to try; of equal scores the larger weight wins, which asks less of the data.
 
     Raises:

@@ -43,7 +43,7 @@ def whitening(covariance: Array, base: BaseParameters) -> Array:
 
     Args:
         covariance: of the base parameters, SI units, shape (base, base).
-        base: their grouping.
+        base: grouping of the link parameters.
 
     Raises:
         ParameterError: the covariance has no inverse; the message says along which parameters.
@@ -113,7 +113,7 @@ def feasibility_test(beta: Array, base: BaseParameters, conditions: FeasibleSet)
 
     Args:
         beta: base parameters in SI units, shape (base,).
-        base: their grouping.
+        base: grouping of the link parameters.
         conditions: the feasible set over the same link parameters.
 
     Raises:
@@ -188,7 +188,7 @@ def feasibility_correction(
 
     Args:
         beta: base parameters in SI units, shape (base,).
-        base: their grouping.
+        base: grouping of the link parameters.
         conditions: the feasible set.
         covariance: of `beta`, shape (base, base): distance then is the root of (b - beta)^T covariance^-1 (b - beta)
             and the result does not depend on which columns are the base; the paper's Euclidean metric of the
@@ -221,10 +221,10 @@ def constrained_least_squares(
     minimised is |rho_1 - R_1 beta|^2 / sigma^2 + weight * divergence(delta, prior), see `priors.py`.
 
     Args:
-        fit: unconstrained.
+        fit: unconstrained least squares.
         base: grouping of the parameters.
         conditions: the feasible set.
-        prior: that the estimate is drawn to.
+        prior: prior that the estimate is drawn to; None for none.
         enough: tolerance of the objective that is enough to compare estimates, such as `ENOUGH`; all digits when None,
             and with a prior.
 

@@ -28,7 +28,7 @@ def bpft_sdpa(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> str
 
     Args:
         beta: base parameters in SI units, shape (base,).
-        base: their grouping.
+        base: grouping of the link parameters.
         conditions: the feasible set over the same link parameters.
 
     Returns:
@@ -51,7 +51,7 @@ def bpfc_sdpa(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> str
 
     Args:
         beta: base parameters b in SI units, shape (base,).
-        base: their grouping.
+        base: grouping of the link parameters.
         conditions: the feasible set over the same link parameters.
 
     Returns:
@@ -87,8 +87,8 @@ class _File:
     """SDPA file: blocks are added one by one, then it is written.
 
     Attributes:
-        title: what the problem is.
-        names: variables in order.
+        title: title of the problem.
+        names: names of the variables, in order.
         objective: c, shape (variables,).
     """
 

@@ -61,8 +61,8 @@ class ComparedSet:
 
     Attributes:
         path: folder or file as it was given.
-        sha256: of the parameter file.
-        file: what is in it.
+        sha256: hash of the parameter file.
+        file: content of the parameter file.
         config: the arm it was identified for; None for a file alone.
     """
 
@@ -154,7 +154,7 @@ class ComparedSet:
         """Return the testable values of some parameters, with their covariance; None without a covariance.
 
         Args:
-            places: which, in the order of the comparison.
+            places: indices of the parameters, in the order of the comparison.
             free: whether values are those before they were held in a feasible set.
         """
         covariance = self.covariance
@@ -196,7 +196,7 @@ class AppliedValues:
 
     Attributes:
         reference: values [SI], shape (shared,).
-        side: of the other, shape (shared,).
+        side: values of the other side [SI], shape (shared,).
         apart: whether they are other values than the tested ones, on either side.
         shares: per joint, the root mean square by which their difference changes its torque, over that of the torque
             and over that of the residual, each of shape (joints,); None where no motion is known.
@@ -229,7 +229,7 @@ def values_in_use(
 
     Args:
         sides: the reference and the other.
-        places: of the shared parameters in each.
+        places: indices of the shared parameters in each side.
         compared: both as they are tested; None where they are not.
     """
     reference, side = (one.file.values[at] for one, at in zip(sides, places, strict=True))
@@ -259,17 +259,17 @@ class Pair:
 
     Attributes:
         side: the one that is compared.
-        places: of the shared parameters in the reference's and in this side's table, each of shape (shared,).
+        places: indices of the shared parameters in the reference's and in this side's table, each of shape (shared,).
         only_reference: expressions that the reference alone has.
         only_side: expressions that this side alone has.
-        difference: of the values that are compared, this side less reference, shape (shared,).
+        difference: difference of the compared values, this side less reference, shape (shared,).
         compared: reference and this side as they are tested; None without covariances.
         drift: the tests; None likewise.
-        reason: why there is no verdict; empty otherwise.
+        reason: reason why there is no verdict; empty otherwise.
         causes: single explanations, the best first; none where no motion is known.
         crossed: the reference's parameters on this side's torques; None where these are not kept.
-        provenance: what differs in how the two came about: key to both values.
-        notes: what a reader must know.
+        provenance: differences in how the two came about: key to both values.
+        notes: notes for the reader.
         in_use: the values that the sides are used with, which need not be those that are tested.
         free: whether values from before any constraint are tested.
         other_shape: joints, from 1, whose friction has another shape on each side, and so is not compared.
@@ -517,10 +517,10 @@ class Finding:
     Attributes:
         what: name of the changed quantity, and of its joint or link.
         sigma: length of the change in standard deviations.
-        joint: the one whose torque changes most for its size; empty where no motion is known.
-        torque_share: of that joint's torque, by which its prediction changes; None likewise.
-        residual_share: of what is unexplained of it; None likewise.
-        size: of the change, in words; may be empty.
+        joint: name of the joint whose torque changes most for its size; empty where no motion is known.
+        torque_share: change of that joint's predicted torque, as a share of its torque; None where no motion is known.
+        residual_share: the same change as a share of that joint's residual; None where no motion is known.
+        size: size of the change, in words; may be empty.
         meaning: possible meaning, in words.
     """
 

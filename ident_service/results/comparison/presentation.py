@@ -62,7 +62,7 @@ def friction_curves(reference: ComparedSet, pair: Pair, place: int) -> list[Figu
     Args:
         reference: the first side.
         pair: the other one.
-        place: of the pair, from 1, for the figures' names.
+        place: number of the pair, from 1, for the figures' names.
     """
     ours, theirs = (_friction(side) for side in (reference, pair.side))
     figures = []

@@ -22,13 +22,15 @@ class Estimated:
     """Estimate among those that stand side by side, with its torque errors.
 
     Attributes:
-        name: for tables; `CAD` for the arm's prior parameters.
+        name: name for tables; `CAD` for the arm's prior parameters.
         values: base parameters in SI units, shape (base,).
-        margin: of the feasibility test, whose sign is the verdict; None where it was not tested.
-        identification: relative torque error on what was fitted to (eq. 84) [percent]; None where it was not computed.
-        validation: likewise on every recording that was never fitted to.
-        moving: as `identification`, without rows of joints near standstill, whose friction is unknown.
-        moving_validation: likewise on every recording that was never fitted to.
+        margin: margin of the feasibility test, whose sign is the verdict; None where it was not tested.
+        identification: relative torque error on the fitted recordings (eq. 84) [percent]; None where it was not
+            computed.
+        validation: relative torque error on every recording that was never fitted to [percent].
+        moving: relative torque error as `identification`, without rows of joints near standstill, whose friction is
+            unknown.
+        moving_validation: relative torque error as `validation`, without rows of joints near standstill.
     """
 
     name: str
@@ -48,10 +50,10 @@ class JointTrace:
     are; where a stretch is a single sample the two are the same.
 
     Attributes:
-        torque: measured, lowest and highest [N m or N], shape (2, stretches).
-        predicted: by the chosen estimate, likewise.
-        residual: measured less predicted, likewise.
-        velocity: of the stretch's middle sample [rad/s or m/s], shape (stretches,).
+        torque: lowest and highest measured torque [N m or N], shape (2, stretches).
+        predicted: lowest and highest torque predicted by the chosen estimate [N m or N], shape (2, stretches).
+        residual: lowest and highest residual, measured less predicted [N m or N], shape (2, stretches).
+        velocity: velocity of the stretch's middle sample [rad/s or m/s], shape (stretches,).
         standstill: whether a row of the stretch was left out of the fit, shape (stretches,).
     """
 
@@ -67,11 +69,11 @@ class Spectrum:
     """Residual of a joint's torque, by frequency and by lag.
 
     Attributes:
-        frequency: increasing [Hz], shape (lines,).
+        frequency: frequencies, increasing [Hz], shape (lines,).
         density: power spectral density of the residual [(N m)^2/Hz or N^2/Hz], shape (lines,).
-        lag: from zero, evenly [s], shape (lags,).
+        lag: lags, evenly from zero [s], shape (lags,).
         correlation: autocorrelation of the residual, 1 at lag zero, shape (lags,).
-        white: what the autocorrelation of a white residual of this length stays below in 95 % of the lags.
+        white: level that the autocorrelation of a white residual of this length stays below in 95 % of the lags.
     """
 
     frequency: Array
@@ -86,9 +88,9 @@ class Spike:
     """Sample of a recording at which a joint in motion has its largest residual.
 
     Attributes:
-        time: since the recording's first sample [s].
-        residual: measured less predicted [N m or N].
-        position: of all joints then [rad or m], shape (joints,).
+        time: time since the recording's first sample [s].
+        residual: residual, measured less predicted torque [N m or N].
+        position: position of all joints at that time [rad or m], shape (joints,).
     """
 
     time: float
@@ -102,10 +104,10 @@ class PredictionTrace:
 
     Attributes:
         name: of the file.
-        sha256: of its bytes.
+        sha256: hash of the file's bytes.
         role: whether it was fitted to.
         time: middle of every stretch since the recording's first sample, increasing [s], shape (stretches,).
-        width: of a stretch [s].
+        width: length of a stretch [s].
         joints: one per joint.
         spectra: one per joint; empty where the recording is too short for one.
         spikes: one per joint, None of a joint that never moves; empty in files of earlier versions.
@@ -129,9 +131,9 @@ class Friction:
     """Friction of one drive: torque less everything that the model has of rigid bodies.
 
     Attributes:
-        velocity: of the points [rad/s or m/s], shape (points,).
-        torque: of the points [N m or N], shape (points,).
-        curve_velocity: increasing, without zero [rad/s or m/s], shape (samples,).
+        velocity: velocity of the points [rad/s or m/s], shape (points,).
+        torque: torque of the points [N m or N], shape (points,).
+        curve_velocity: velocities of the curve, increasing, without zero [rad/s or m/s], shape (samples,).
         curve_torque: the model's friction in steady motion [N m or N], shape (samples,).
         terms: the base parameters that it consists of, as their expressions.
     """
@@ -150,8 +152,8 @@ class Condition:
     Attributes:
         name: of the condition, for people.
         links: the links that it is about, counted from 0.
-        margin: its smallest eigenvalue or number, SI units.
-        scaled: the same in units of its reference scales, comparable between conditions.
+        margin: smallest eigenvalue or number of the condition, SI units.
+        scaled: margin in units of the condition's reference scales, comparable between conditions.
     """
 
     name: str
@@ -180,7 +182,7 @@ class PosedArm:
     """Arm in one posture of its recordings, with the bodies of its links.
 
     Attributes:
-        points: of base, joint and link frames in the base frame [m], shape (points, 3).
+        points: origins of base, joint and link frames in the base frame [m], shape (points, 3).
         branches: for every branch of the arm its points from base to end.
         bodies: one per link.
     """
@@ -198,12 +200,13 @@ class Timing:
         recording: name of the file.
         source: `cycle` where the loop told how late it began every cycle, `stamps` where only the steps between
             stamps are known.
-        edges: of the histogram, increasing [s]; of lateness, or of how far steps are from the usual one; (bins + 1,).
+        edges: edges of the histogram of lateness, or of how far steps are from the usual one, increasing [s], shape
+            (bins + 1,).
         counts: cycles or steps per bin, shape (bins,).
-        samples: their number.
-        rate: the usual one [Hz].
+        samples: number of cycles or steps.
+        rate: usual rate [Hz].
         largest: the largest lateness or distance from the usual step [s].
-        compute: the longest time a cycle computed [s]; None where it is not known.
+        compute: longest computing time of a cycle [s]; None where it is not known.
         gaps: per gap, seconds after the first sample and its length [s], the longest first, at most 100.
         gap_count: number of gaps.
         lost: frames lost; None where it is not known.
@@ -231,18 +234,18 @@ class Evidence:
     """Everything of an identification that a report shows beside the parameters.
 
     Attributes:
-        parameters_sha256: of the parameter file that it belongs to.
-        joints: their names.
+        parameters_sha256: hash of the parameter file that it belongs to.
+        joints: names of the joints.
         revolute: per joint, whether it turns (N m, rad/s) or slides (N, m/s).
         estimates: side by side; the CAD values first where there are any.
         unconstrained: number of the estimate that no feasible set bends.
         constrained: number of the one inside the arm's feasible set.
         chosen: number of the one that `parameters.json` has.
         bounds: per base parameter, the conditions that its link parameters press against.
-        recordings: those fitted to, then those that were not.
+        recordings: recordings fitted to, then those that were not.
         friction: one per drive; empty where the model has no friction.
         conditions: every condition, where there are link parameters.
-        posed: where there are link parameters.
+        posed: the arm in one posture; None without link parameters.
         timing: one per recording.
         warnings: what is wrong with the recordings, in words.
     """

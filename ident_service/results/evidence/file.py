@@ -46,7 +46,7 @@ def unpacked(content: Mapping[str, Any], shape: tuple[int | None, ...]) -> Array
 
     Args:
         content: of a file.
-        shape: what it must have; None where any length will do.
+        shape: required shape; None where any length will do.
 
     Raises:
         ParameterError: not a packed array of this shape.

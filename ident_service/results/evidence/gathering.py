@@ -245,7 +245,7 @@ class Envelope:
         """Add the next samples.
 
         Args:
-            time: not decreasing, not below that of earlier samples [s], shape (samples,).
+            time: times, not decreasing, not below that of earlier samples [s], shape (samples,).
             values: shape (series, samples).
             marked: samples whose stretch is to be marked, shape (series, samples).
         """
@@ -384,7 +384,7 @@ def spread(x: Array, y: Array) -> tuple[Array, Array]:
 
     Args:
         x: shape (points,).
-        y: likewise.
+        y: shape (points,).
     """
     if len(x) <= _MOST_POINTS:
         return x, y
@@ -455,8 +455,8 @@ def friction_term(term: JointTerm, velocity: Array, layout: Layout, drive: int) 
 
     Args:
         term: one of the model's friction terms.
-        velocity: of the drive, not zero [rad/s or m/s].
-        layout: its Stribeck velocities.
+        velocity: velocity of the drive, not zero [rad/s or m/s].
+        layout: layout with the Stribeck velocities.
         drive: number of the drive.
     """
     sign = np.sign(velocity)
@@ -488,10 +488,10 @@ def gather_evidence(
     """Return everything that a report shows of an estimate and its recordings.
 
     Args:
-        estimate: made from `recordings` and judged on `validation`.
-        recordings: those fitted to.
-        validation: those that were not.
-        parameters_sha256: of the parameter file that holds the estimate.
+        estimate: estimate made from `recordings` and judged on `validation`.
+        recordings: recordings that were fitted to.
+        validation: recordings that were not fitted to.
+        parameters_sha256: hash of the parameter file that holds the estimate.
         warnings: what is wrong with the recordings, in words.
 
     Raises:
@@ -532,8 +532,8 @@ def evidence_without_samples(estimate: Estimate, parameters_sha256: str) -> Evid
     That is no trace, spectrum, friction curve or timing; bodies stand in the middle of the joints' ranges.
 
     Args:
-        estimate: to show.
-        parameters_sha256: of the parameter file that holds the estimate.
+        estimate: estimate to show.
+        parameters_sha256: hash of the parameter file that holds the estimate.
     """
     limits = [estimate.model.config.joints[name].position for name in estimate.model.chain.names]
     middle = np.array([[0.0 if ends is None else 0.5 * (ends[0] + ends[1]) for ends in limits]])

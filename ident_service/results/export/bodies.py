@@ -14,9 +14,9 @@ def moved(parameters: Array, rotation: Array, translation: Array) -> Array:
     """Return the body's parameters in another frame.
 
     Args:
-        parameters: of eq. 13, shape (10,).
-        rotation: of its frame in the other, shape (3, 3).
-        translation: of its frame's origin in the other [m], shape (3,).
+        parameters: parameters of eq. 13, shape (10,).
+        rotation: rotation of the body's frame in the other, shape (3, 3).
+        translation: translation of its frame's origin in the other [m], shape (3,).
     """
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotation, translation

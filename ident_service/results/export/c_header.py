@@ -52,7 +52,7 @@ def c_lines(tape: ExpressionGraph, inputs: Mapping[int, str], outputs: Sequence[
     """Return the body of a C function, indented.
 
     Args:
-        tape: what was recorded.
+        tape: recorded expression graph.
         inputs: C expressions of the tape's inputs, by index.
         outputs: targets and their values; all of them are written after everything has been read.
     """
@@ -90,7 +90,7 @@ def run_c_lines(lines: Sequence[str], arrays: Mapping[str, Array]) -> dict[str, 
 
     Args:
         lines: the body of a function.
-        arrays: what `name[k]` stands for: arrays of shape (length, samples).
+        arrays: arrays that `name[k]` stands for, by name, each of shape (length, samples).
 
     Returns:
         By name, the arrays that were written to, shape (length, samples).
@@ -339,7 +339,7 @@ def read_c_header(text: str, name: str, function: str, states: dict[str, Array])
 
     Args:
         text: the header.
-        name: what its names begin with.
+        name: prefix of the names in it.
         function: `rigid_dynamics`, `friction`, `gravity` or `mass_matrix`.
         states: `q`, `dq` and `ddq`, each of shape (joints, samples).
 

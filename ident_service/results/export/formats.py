@@ -43,7 +43,7 @@ def csv_export(arm: IdentifiedArm, name: str) -> str:
     """Return all parameters as a table; numbers read back as the same ones.
 
     Args:
-        arm: with link parameters or without.
+        arm: arm, with link parameters or without.
         name: of the file, for errors.
 
     Raises:
@@ -93,7 +93,7 @@ def json_export(arm: IdentifiedArm, name: str) -> str:
     """Return the arm as JSON, after the same torques were computed from it.
 
     Args:
-        arm: with link parameters or without.
+        arm: arm, with link parameters or without.
         name: of the file, for errors.
 
     Raises:
@@ -206,11 +206,11 @@ class Export:
     """File of an export, with the data that it does not carry.
 
     Attributes:
-        format: of `FORMATS`.
+        format: name of the format, one of `FORMATS`.
         name: of the file.
-        text: its content.
-        not_carried: what of the arm the format has no place for, in words.
-        notes: what else its reader should know.
+        text: content of the file.
+        not_carried: parts of the arm that the format has no place for, in words.
+        notes: further notes for the reader.
     """
 
     format: str
@@ -317,8 +317,8 @@ def export_run(
 
     Args:
         run: the folder, every file in it as its manifest says.
-        formats: of `FORMATS`.
-        folder: where the files appear; others in it stay.
+        formats: names of the formats, of `FORMATS`.
+        folder: folder for the files; others in it stay.
         step: called with each format before it is made, and the share of them that is done, from 0 to 1.
         anyway: whether to export parameters that must not be used; every file is marked then.
 

@@ -39,10 +39,11 @@ class IdentifiedArm:
         sigma: standard deviations of the base parameters, None where unknown.
         verdicts: one word per base parameter, empty where unknown.
         source: SHA-256 of the parameter file.
-        feasible_set: that the values are held in; `none` where they are not.
-        unconstrained: base parameters before that [SI], to which `sigma` belongs, shape (base,); None where unknown.
-        motion: that it was identified from; None where the file does not have it.
-        forbidden: why its values must not be used; empty where nothing says so.
+        feasible_set: feasible set that the values lie in; `none` where they are not held in any.
+        unconstrained: base parameters before they were held in the set [SI], to which `sigma` belongs, shape (base,);
+            None where unknown.
+        motion: motion that the arm was identified from; None where the file does not have it.
+        forbidden: reasons why its values must not be used; empty where nothing says so.
     """
 
     model: ArmModel

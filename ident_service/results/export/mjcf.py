@@ -41,8 +41,8 @@ def mjcf_export(
         model: the arm.
         delta: link parameters, shape (layout.size,).
         name: of the file, for errors.
-        said: of its bodies, for a comment in it.
-        motion: that the arm was identified from, which says how large the torque of what is lost is.
+        said: statements about its bodies, for a comment in it.
+        motion: motion that the arm was identified from, which says how large the torque of what is lost is.
 
     Returns:
         The text, and what it does not carry.

@@ -76,8 +76,8 @@ def require_same_torques(model: ArmModel, delta: Array, written: WrittenArm, has
     Args:
         model: the arm.
         delta: link parameters, shape (layout.size,).
-        written: what was read back.
-        has: what the file carries.
+        written: arm that was read back.
+        has: terms that the file carries.
         name: of the file.
 
     Raises:
@@ -126,8 +126,8 @@ class RecordedMotion:
 
     Attributes:
         base: the grouping of the parameters.
-        information: of the equations on the base parameters.
-        rows: their number per joint, each by the square of its weight, shape (joints,).
+        information: information of the equations on the base parameters.
+        rows: sum of the squared weights of each joint's rows, shape (joints,).
     """
 
     base: BaseParameters
@@ -138,7 +138,7 @@ class RecordedMotion:
         """Return the torque of link parameters over the motion, root mean square per joint [N m or N], (joints,).
 
         Args:
-            delta: of which all that does not count is zero, shape (layout.size,).
+            delta: link parameters, zero where they do not count, shape (layout.size,).
         """
         beta, known = self.base.K @ delta, self.information
         sums = [
@@ -167,8 +167,8 @@ def unsupported_terms(
     Args:
         model: the arm.
         delta: link parameters, shape (layout.size,).
-        has: what the file carries.
-        motion: that it was identified from; None where it is not known.
+        has: terms that the file carries.
+        motion: motion that the arm was identified from; None where it is not known.
     """
     found = []
     for term in model.layout.terms:

@@ -47,7 +47,7 @@ def read_sdf(
     Args:
         text: the file.
         name: of the file, for errors.
-        gravity: of the world it is put in [m/s^2].
+        gravity: gravity of the world that the model is put in [m/s^2].
         joint_names: other names for its joints.
 
     Raises:
@@ -171,8 +171,8 @@ def sdf_export(
         model: the arm.
         delta: link parameters, shape (layout.size,).
         name: of the file, for errors.
-        said: of its bodies, for a comment in it.
-        motion: that the arm was identified from, which says how large the torque of what is lost is.
+        said: statements about its bodies, for a comment in it.
+        motion: motion that the arm was identified from, which says how large the torque of what is lost is.
 
     Returns:
         The text, what it does not carry, and notes.

@@ -50,9 +50,9 @@ class Element:
     """XML element and its place, in bytes of the UTF-8 text.
 
     Attributes:
-        tag: its name.
-        attributes: in the order of the text.
-        start: of its first tag.
+        tag: name of the tag.
+        attributes: attributes, in the order of the text.
+        start: start of its first tag.
         head: end of its first tag.
         foot: start of its last tag; `head` where it has none, as in `<a/>`.
         end: of its last tag.
@@ -196,7 +196,7 @@ def original_urdf(model: ArmModel, delta: Array, has: Carried) -> tuple[str, tup
     """Return the original file with identified values.
 
     Args:
-        model: of an arm that a URDF describes.
+        model: model of an arm that a URDF describes.
         delta: link parameters, shape (layout.size,).
         has: the friction terms to write.
 
@@ -390,8 +390,8 @@ def urdf_export(
         model: the arm.
         delta: link parameters, shape (layout.size,).
         name: of the file, for errors.
-        said: of its bodies, for a comment at its end.
-        motion: that the arm was identified from, which says how large the torque of what is lost is.
+        said: statements about its bodies, for a comment at its end.
+        motion: motion that the arm was identified from, which says how large the torque of what is lost is.
 
     Returns:
         The text, what it does not carry, and notes.

@@ -48,11 +48,11 @@ class Figure:
 
     Attributes:
         slug: name of its file, without an ending.
-        title: what a screen reader says first.
+        title: title, which a screen reader says first.
         description: content of the drawing, for readers who cannot see it.
-        caption: what it says.
+        caption: statement of the drawing, in words.
         canvas: the drawing.
-        data: that the page's script needs, by the name of an attribute.
+        data: data for the page's script, by the name of an attribute.
         wide: whether it needs the whole width of a page.
         more: heading and drawing of what a reader may unfold below it, for a page that has the style sheet.
     """
@@ -78,7 +78,7 @@ def _readable(axes: Axes, x: str, y: str, names: Mapping[str, str], *, logs: tup
         axes: of the plot.
         x: quantity that lies across, its unit in brackets.
         y: quantity that stands upright, likewise.
-        names: of what is drawn, by the kind of its shapes.
+        names: names of the drawn things, by the kind of their shapes.
         logs: whether the axes show the logarithm of x, and of y.
     """
     return {

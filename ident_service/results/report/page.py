@@ -192,8 +192,8 @@ def friction_table(evidence: Evidence, parameters: ParameterFile, order: Sequenc
     """Return, per joint, how far friction lies off its curve, and the shape parameters that the curve has.
 
     Args:
-        evidence: with friction.
-        parameters: of the same estimate.
+        evidence: evidence with friction.
+        parameters: parameter file of the same estimate.
         order: numbers of the joints, the worst first.
     """
     found = parameters.content.get("friction", {})
@@ -264,7 +264,7 @@ def report_html(evidence: Evidence, parameters: ParameterFile, config: ArmConfig
     """Return the report of an identification as HTML.
 
     Args:
-        evidence: what was gathered while the estimate was at hand.
+        evidence: evidence that was gathered while the estimate was at hand.
         parameters: the parameter file that it belongs to.
         config: the arm as it was identified.
         sha256: name to SHA-256 of the files beside it.

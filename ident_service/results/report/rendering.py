@@ -25,7 +25,7 @@ class Cell:
     """Cell of a table.
 
     Attributes:
-        words: what is read.
+        words: words of the cell.
         value: the number behind it, with all its digits; None where it is no number.
         kind: a class of the style sheet.
     """
@@ -40,7 +40,7 @@ class Table:
     """Table with a caption; the first cell of every row is its head.
 
     Attributes:
-        caption: what it shows.
+        caption: caption of the table.
         heads: of the columns.
         rows: the worst first where some are worse than others.
         kind: a class of the style sheet.
@@ -81,7 +81,7 @@ def render(template: str, scripts: Sequence[str] = (), styles: Sequence[str] = (
 
     Args:
         template: name of the file in `templates`.
-        scripts: that stand in the page, in order; text of this package alone.
+        scripts: scripts of the page, in order; text of this package alone.
         styles: further style sheets.
         values: of the template; every one that it names must be there.
     """

@@ -72,7 +72,7 @@ def verdict(evidence: Evidence, parameters: ParameterFile) -> list[str]:
     """Return the verdict in sentences.
 
     Args:
-        evidence: what was gathered while the estimate was at hand.
+        evidence: evidence that was gathered while the estimate was at hand.
         parameters: the parameter file that it belongs to.
     """
     return [
