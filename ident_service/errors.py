@@ -27,6 +27,7 @@
         │   ├── ActionNeeded           a person has to act at the arm first, as the message says
         │   │   └── EmergencyStopped   the emergency stop is pressed, or has been
         │   ├── AnotherDrive           a drive answers that the description does not name
+        │   ├── UnsuitableDrive        a drive cannot be driven as the description says
         │   ├── NobodyEnabled          a person did not enable the arm in time, or is no longer waited for
         │   └── PositionUnknown        the encoders lost their zero: a person must set the home
         ├── Stopped                    a motion did not come to its end, because a stop was requested
@@ -256,6 +257,10 @@ class EmergencyStopped(ActionNeeded):
 
 class AnotherDrive(DriverError):
     """A drive has another identity than the description says."""
+
+
+class UnsuitableDrive(DriverError):
+    """A drive cannot be driven as the description says; the message says what to change, or what it lacks."""
 
 
 class NobodyEnabled(DriverError):
