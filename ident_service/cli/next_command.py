@@ -213,9 +213,27 @@ def _recovered(ended: Ended) -> list[str]:
     return ["recover" if getattr(ended.given, "dry_run", False) else "preflight", ended.arm]
 
 
+def _described(ended: Ended, arm: str) -> bool:
+    """Return whether an arm has a description by this name; commands to a moving arm know more: its name alone."""
+    from ident_service.config.load import shipped_arms
+
+    return ended.remote or Path(arm).name != arm or Path(arm).suffix != "" or arm in shipped_arms()
+
+
 def _stopped(ended: Ended) -> list[str] | None:
     names = [ended.arm] if ended.given.arm is not None else ended.said.get("arms", [])
-    return ["recover", names[0]] if names else ["arms"]
+    if not names:
+        return ["arms"]
+    return ["recover", names[0]] if _described(ended, names[0]) else None
+
+
+def _recover(ended: Ended) -> list[str] | None:
+    return ["recover", ended.arm] if _described(ended, ended.arm) else None
+
+
+def _arms(ended: Ended) -> list[str]:
+    names = [one["name"] for one in ended.said["arms"] if _described(ended, one["name"])]
+    return ["config", "check", names[-1]] if names else ["simulate"]
 
 
 def _identified(ended: Ended) -> list[str]:
@@ -257,6 +275,8 @@ def _verified(ended: Ended) -> list[str] | None:
 
 def _fleet(ended: Ended) -> list[str]:
     given = ended.given
+    if ended.remote:  # the patterns were of arms there
+        return ["runs"]
     more = [word for name in ("names", "store") if getattr(given, name) for word in (f"--{name}", getattr(given, name))]
     verb = "identify" if given.word == "fleet status" and given.patterns else "status"
     return ["fleet", verb, *given.patterns, "--arm", given.arm, *more]
@@ -314,7 +334,7 @@ _FOLLOWS: dict[str, Follows] = {
     "new": lambda ended: ["config", "check", str(ended.said["description"])],
     "config check": _checked,
     "base-parameters": _arm("design"),
-    "arms": lambda ended: ["config", "check", ended.said["arms"][-1]["name"]] if ended.said["arms"] else ["simulate"],
+    "arms": _arms,
     "bus load": _arm("bus", "scan", otherwise=("config", "check")),
     "bus scan": _arm("bus", "probe", otherwise=("bus", "scan")),
     "bus probe": _probed,
@@ -340,7 +360,7 @@ _FOLLOWS: dict[str, Follows] = {
     "pause": _arm("resume"),
     "resume": _arm("pause"),
     "finish": lambda ended: ["runs", "--arm", str(ended.said.get("arm", ended.arm))],
-    **dict.fromkeys(("supported", "acknowledge"), _arm("recover")),
+    **dict.fromkeys(("supported", "acknowledge"), _recover),
     "recover": _recovered,
     **dict.fromkeys(("home", "set-home"), _homed),
     **dict.fromkeys(("simulate", "identify"), _identified),

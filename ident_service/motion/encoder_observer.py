@@ -5,8 +5,8 @@ asked is not how hard a joint is pushed but what the push must have done. The pu
 fed forward. Dry friction f holds a joint that stands still within `[-f, f]`, so the push can change by
 `2 f` from the `c_0` with which the position last changed before the joint must move; one that was sliding is held by
 `f` already, and a change that pushes it on in its direction moves it, but for what friction is larger at rest. If its
-push braked it, what it braked with may end as well: that brings a joint to rest and moves none. With the allowance b of
-these cases, never more than that of a joint that stands,
+push braked it, and its last step is so small that it may have come to rest within that cycle, the push that braked it
+may end as well, which moves no joint. With the allowance b of these cases, never more than that of a joint that stands,
 
     dv = max(|c - c_0| - b, 0) / m_jj(q) dt          dd = v dt
 
@@ -150,14 +150,14 @@ class FrozenEncoderObserver:
         # Push, feedback acceleration and friction fed forward with which each position last changed.
         self._base, self._base_answer, self._base_fed = ([0.0] * len(friction) for _ in range(3))
         self._none: Flags = np.zeros(len(friction), dtype=bool)
-        self._direction, self._slid = [0.0] * len(friction), [0.0] * len(friction)
+        self._direction, self._slid, self._step = ([0.0] * len(friction) for _ in range(3))
         self._cycle, self._slides_within = 0, max(1, round(SLID / period))
         self._stepped = [0] * len(friction)
         self._owing = False
 
     def update(
         self,
-        direction: Vector,
+        steps: Vector,
         correction: Vector,
         answer: Vector,
         position: Vector,
@@ -166,8 +166,8 @@ class FrozenEncoderObserver:
         """Update the missing motion for one cycle, and return which encoders cannot hide it.
 
         Args:
-            direction: direction of each position's change, 1 or -1, or 0 where it did not change or was not measured,
-                shape (joints + drives,).
+            steps: change of each position since the cycle before [rad or m], 0 where it was not measured, shape
+                (joints + drives,).
             correction: feedback torque [N m or N], shape (joints,); all zero where no position is asked for, which
                 allows no conclusion.
             answer: feedback acceleration [rad/s^2 or m/s^2], shape (joints,).
@@ -183,7 +183,7 @@ class FrozenEncoderObserver:
         fed = encoders.forces(fed)
         correction, answer = encoders.forces(correction), encoders.velocities(answer)
         pushed = correction + fed
-        self._note_changes(direction, pushed, answer, fed)
+        self._note_changes(steps, pushed, answer, fed)
         shifts = [push - base for push, base in zip(pushed.tolist(), self._base, strict=True)]
         limits = zip(shifts, self._slid, self._sliding, self._standing, strict=True)
         most = [sliding if shift * slid > 0.0 else standing for shift, slid, sliding, standing in limits]
@@ -198,7 +198,9 @@ class FrozenEncoderObserver:
             return self._none
         change, inertia = np.array(shifts), encoders.inertias(self._dynamics.mass_matrix(position))
         braking = np.maximum(-np.array(self._slid) * (inertia * self._base_answer + self._base_fed), 0.0)
-        allowed = np.minimum(np.array(most) + braking, self._standing)
+        stopping = (braking + self._standing) / inertia * self._period**2  # the longest step that ends at rest, twice
+        rests = np.array(self._step) <= stopping
+        allowed = np.where(rests, np.minimum(np.array(most) + braking, self._standing), most)
         own = np.sign(change) * (inertia * (answer - self._base_answer) + fed - self._base_fed)
         push = np.minimum(np.abs(change), own) - allowed
         acting, gained = push > 0.0, push / encoders.inertias(self._least.mass_matrix(position)) * self._period
@@ -207,12 +209,13 @@ class FrozenEncoderObserver:
         self._owing = True
         return np.asarray(self._way > self._hidden)
 
-    def _note_changes(self, direction: Vector, pushed: Vector, answer: Vector, fed: Vector) -> None:
+    def _note_changes(self, steps: Vector, pushed: Vector, answer: Vector, fed: Vector) -> None:
         """Note with what each position that has changed did so, and whether its joint slides."""
-        rows = zip(direction.tolist(), pushed.tolist(), answer.tolist(), fed.tolist(), strict=True)
-        for k, (towards, push, acceleration, friction) in enumerate(rows):
-            if towards == 0.0:
+        rows = zip(steps.tolist(), pushed.tolist(), answer.tolist(), fed.tolist(), strict=True)
+        for k, (step, push, acceleration, friction) in enumerate(rows):
+            if step == 0.0:
                 continue
+            towards, self._step[k] = 1.0 if step > 0.0 else -1.0, abs(step)
             slides = towards == self._direction[k] and self._cycle - self._stepped[k] <= self._slides_within
             self._slid[k] = towards if slides else 0.0
             self._direction[k], self._stepped[k] = towards, self._cycle

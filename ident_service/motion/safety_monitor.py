@@ -398,8 +398,8 @@ class SafetyMonitor:
             self._previous_target = self._target
         self._count_unchanged(same, velocity)
         if self._encoder_observer is not None and answer is not None:
-            direction = np.subtract(steps > 0.0, steps < 0.0, dtype=float) * valid
-            self._owes = self._encoder_observer.update(direction, correction, answer, self._position, feedforward)
+            seen = np.where(valid, steps, 0.0)
+            self._owes = self._encoder_observer.update(seen, correction, answer, self._position, feedforward)
         held = answered and self._all_fresh and self._quiet(sample.position, reference.position, velocity)
         if held and self._plain(sample):
             # Copied, in case that a driver fills the same array again.

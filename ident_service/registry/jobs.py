@@ -149,7 +149,7 @@ def typical_seconds(db: Database, kind: str, arm: str | None) -> float | None:
     """Return the median duration of the last completed jobs of a kind [s]; None before there was one."""
     rows = db.rows(
         "SELECT ended - started AS seconds FROM jobs WHERE kind = ? AND arm IS ? AND state IN ('done', 'refused') "
-        "ORDER BY number DESC LIMIT 9",
+        "AND started IS NOT NULL ORDER BY number DESC LIMIT 9",
         *(kind, arm),
     )
     lengths = sorted(row["seconds"] for row in rows)

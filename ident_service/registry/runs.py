@@ -126,7 +126,7 @@ def recordings_of(db: Database, patterns: Sequence[str]) -> list[Row]:
     """
     found = db.rows(
         "SELECT runs.id AS run, arm, name FROM recordings JOIN runs ON runs.id = recordings.run "
-        "WHERE deleted IS NULL AND kind IN ('run', 'recording') ORDER BY runs.id, name"
+        "WHERE deleted IS NULL AND kind IN ('motion', 'recording') ORDER BY runs.id, name"
     )
     return [row for row in found if any(fnmatchcase(str(row["arm"]), pattern) for pattern in patterns)]
 

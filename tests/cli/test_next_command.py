@@ -89,6 +89,8 @@ TABLE: list[tuple[str, int, Mapping[str, Any], str]] = [
     ("compare a b", 0, {"verdict": "unchanged"}, "report b"),
     ("feasible t.json", 3, {}, "project t.json --out feasible.json"),
     ("fleet status 'a/*' --arm wam7 --store s", 0, {}, "fleet identify 'a/*' --arm wam7 --store s"),
+    ("fleet identify 'a*' --arm wam7 --server http://h:1", 0, {}, "runs --server http://h:1"),
+    ("arms", 0, {"arms": [{"name": "planar2"}, {"name": "two"}]}, "config check planar2"),
     ("runs", 0, {"runs": []}, "simulate"),
     ("runs", 0, {"runs": [RUN]}, "identify r1 --arm planar2"),
     ("runs", 0, {"runs": [RUN | {"kind": "identification"}]}, "report r1"),
@@ -141,6 +143,14 @@ def test_what_refused_or_stopped_a_motion_is_followed_by_what_clears_it(
     words: str, error: IdentError, line: str
 ) -> None:
     assert next_after_error(TOP.parse_args(words.split()), error) == line
+
+
+@pytest.mark.parametrize(
+    ("words", "said"), [("stop two", {"arm": "two"}), ("stop", {"arms": ["two"]}), ("acknowledge two late_cycles", {})]
+)
+def test_an_arm_that_is_known_by_its_name_only_is_in_no_next_command(words: str, said: Mapping[str, Any]) -> None:
+    """Commands to a moving arm know its name; its description is a file that only whoever began the motion knows."""
+    assert next_line(TOP.parse_args(shlex.split(words)), 0, said) == ""
 
 
 def test_a_probe_of_files_that_no_command_helps_names_none() -> None:

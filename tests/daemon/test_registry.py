@@ -15,6 +15,7 @@ from ident_service.daemon.jobs.outcome import ProcessOutput, outcome
 from ident_service.errors import UnknownId, UsageError
 from ident_service.registry import jobs
 from ident_service.registry.database import FILE, MIGRATIONS, Database, audit_log, note
+from ident_service.registry.runs import recordings_of
 from ident_service.registry.tokens import TOKEN_FILE, access, add_token, first_token, read_token, revoke_token, tokens
 
 
@@ -129,8 +130,22 @@ def test_typical_durations_are_medians_of_what_came_to_its_end(tmp_path: Path) -
         for number, (seconds, state) in enumerate([(10, "done"), (12, "done"), (500, "done"), (1, "failed")]):
             jobs.add_job(db, str(number), "run", "a", {}, [], "me", motion=True, run=None)
             db.write("UPDATE jobs SET state = ?, started = 0, ended = ? WHERE id = ?", state, seconds, str(number))
+        jobs.add_job(db, "waited", "run", "a", {}, [], "me", motion=True, run=None)
+        assert jobs.ended(db, "waited", "refused", "its confirmation was too old")
         assert jobs.typical_seconds(db, "run", "a") == 12
         assert jobs.typical_seconds(db, "run", "b") is None
+
+
+def test_recordings_of_arms_are_those_of_motions_and_uploads(tmp_path: Path) -> None:
+    with Database(tmp_path) as db:
+        for kind in ("motion", "recording", "identification", "simulation"):
+            for arm in ("bench1", "other"):
+                run, values = f"{kind}-{arm}", "(?, ?, ?, NULL, 1.0, 'done', NULL, 2.0, 3.0)"
+                db.write(f"INSERT INTO runs VALUES {values}", run, kind, arm)  # noqa: S608
+                db.write("INSERT INTO recordings VALUES (?, 'run.mcap', 'a', 1, NULL)", run)
+        db.write("INSERT INTO recordings VALUES ('motion-bench1', 'gone.mcap', 'a', 1, 2.0)")
+        found = [(row["run"], row["name"]) for row in recordings_of(db, ["bench*"])]
+        assert found == [("motion-bench1", "run.mcap"), ("recording-bench1", "run.mcap")]
 
 
 def test_only_the_hash_of_a_token_is_kept(tmp_path: Path) -> None:

@@ -29,15 +29,16 @@ INERTIA = np.diag(DYNAMICS.mass_matrix(HOME))
 FRICTION, STEP = np.array([0.8, 0.3]), np.full(2, 1e-5)
 HIDDEN = HIDDEN_SHARE * LIMITS.following_error + STEPS * STEP
 NONE, STILL = np.zeros(2), np.zeros(2)
+LAST = 1e-7  # rad, a step within which a joint may have come to rest
 
 
 def observer() -> FrozenEncoderObserver:
     return FrozenEncoderObserver(DYNAMICS, LIMITS, PERIOD, FRICTION, STEP)
 
 
-def shown(owed: FrozenEncoderObserver, direction: Array, correction: Array) -> Array:
+def shown(owed: FrozenEncoderObserver, steps: Array, correction: Array) -> Array:
     """Corrections that are each joint's own."""
-    return owed.update(direction, correction, correction / INERTIA, HOME)
+    return owed.update(steps, correction, correction / INERTIA, HOME)
 
 
 def cycles_until(owed: FrozenEncoderObserver, correction: Array, most: int = 3000) -> int | None:
@@ -87,13 +88,22 @@ def test_a_joint_that_slid_is_held_by_less_on_its_way_and_by_as_much_back(direct
         assert (cycles_until(owed, way * direction * between) is not None) == found, (apart, way)
 
 
+def test_a_joint_that_was_too_fast_to_come_to_rest_within_a_cycle_has_not_been_braked_to_rest() -> None:
+    friction = FRICTION[1]
+    most = (1.0 + STANDING) * friction / INERTIA[1] * PERIOD**2  # the step within which it may have come to rest, twice
+    for step, found in ((0.99 * most, False), (1.01 * most, True)):
+        owed = observer()
+        slid(owed, step, 1, -friction * unit(1))
+        assert (cycles_until(owed, 0.5 * friction * unit(1)) is not None) == found
+
+
 @pytest.mark.parametrize("direction", [-1.0, 1.0])
 def test_the_end_of_braking_is_no_push(direction: float) -> None:
     way, friction = direction * unit(1), FRICTION[1]
     for braking, most in ((-0.5, 1.5), (-1.5, 2.5), (-9.0, STANDING), (0.5, SLIDING)):
         for excess, found in ((-0.05, False), (0.05, True)):
             owed = observer()
-            slid(owed, direction, 1, braking * friction * way)
+            slid(owed, direction * LAST, 1, braking * friction * way)
             assert (cycles_until(owed, (braking + most + excess) * friction * way) is not None) == found
 
 
@@ -102,7 +112,7 @@ def test_friction_fed_forward_against_the_motion_brakes() -> None:
     for excess, found in ((-0.05, False), (0.05, True)):
         owed = observer()
         for _ in range(2):
-            owed.update(way, NONE, NONE, HOME, -friction * way)
+            owed.update(LAST * way, NONE, NONE, HOME, -friction * way)
         push = (SLIDING + excess) * friction * way
         seen = [bool(owed.update(STILL, push, push / INERTIA, HOME).any()) for _ in range(3000)]
         assert any(seen) == found
