@@ -29,7 +29,7 @@ from drivers.canopen.sdo import Change, DryRunObjects, Objects, optional
 from drivers.canopen.stored_zero import zeros_of
 from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanopenDriver
-from ident_service.config.eds import DataSheet, data_sheet
+from ident_service.config.eds import DataSheet, DataSheetEntry, data_sheet
 from ident_service.config.quantities import TextFile
 from ident_service.errors import DriverError, UsageError
 
@@ -141,6 +141,8 @@ def require_drives(config: ArmConfig, why: str = "only CANopen drives are config
 
 
 _NUMBERS = {1: Kind.U8, 2: Kind.I8, 3: Kind.I16, 4: Kind.I32, 5: Kind.U8, 6: Kind.U16, 7: Kind.U32}  # CiA 301, table 44
+_BOOLEAN = 1
+_SHOWN = 3  # mistakes of a file that are told
 _IDENTITY = {"vendor": (od.VENDOR, 1), "product": (od.PRODUCT, 2)}
 # Of the host, at every opening or in every cycle.
 _OURS = frozenset(
@@ -193,7 +195,8 @@ def import_configuration(
         open_bus: function that opens the links, in the order of the buses.
 
     Raises:
-        UsageError: no CANopen drives, not a file each, or a file that configures nothing.
+        UsageError: no CANopen drives, not a file each, or a file that configures nothing, or has a value that is no
+            number or that its entry cannot hold; no bus has been opened.
         DriverError: a bus is in use, or lost; a drive is on, or another than the file's; nothing has been written. Or
             values could not be set back: the message names them.
     """
@@ -231,20 +234,48 @@ def import_configuration(
 
 
 def _configured(file: TextFile, node: int) -> dict[int, Write]:
-    """Return the values that a DCF gives to its drive, by key; raises UsageError where there are none."""
+    """Return the values that a DCF gives to its drive, by key; raises UsageError for a wrong one, or for none."""
     sheet = data_sheet(file.text)
-    found = {}
+    found, wrong = {}, []
     for key, entry in sorted(sheet.entries.items()):
-        kind, value = _NUMBERS.get(entry.kind), entry.number(node)
-        if entry.configured and entry.writable and kind is not None and value is not None:
-            bits = 8 * kind.size
-            signed = kind in (Kind.I8, Kind.I16, Kind.I32)
-            value = value - (1 << bits) if signed and value >= 1 << (bits - 1) else value
-            found[key] = Write(Entry(key >> 8, key & 0xFF, kind, "value of the DCF"), value)
+        kind = _NUMBERS.get(entry.kind)
+        if not entry.configured or not entry.writable or kind is None:
+            continue
+        try:
+            found[key] = Write(Entry(key >> 8, key & 0xFF, kind, "value of the DCF"), _value(key, entry, kind, node))
+        except ValueError as error:
+            wrong.append(f"{entry.place}={(entry.text or '')[:40]}: {error}")
+    if wrong:
+        more = f"; and {len(wrong) - _SHOWN} more" if len(wrong) > _SHOWN else ""
+        raise UsageError(f"{file.name}: {'; '.join(wrong[:_SHOWN])}{more}; nothing was written")
     if not found:
         why = sheet.mistake or "no entry has a ParameterValue; an EDS describes a kind of drive, a DCF configures one"
         raise UsageError(f"{file.name}: configures no drive: {why}")
     return found
+
+
+def _value(key: int, entry: DataSheetEntry, kind: Kind, node: int) -> int:
+    """Return the value that a DCF gives to an entry; raises ValueError in words where the entry cannot hold it."""
+    if (value := entry.standard_number(node)) is None:
+        raise ValueError("is no whole number; write 100, 0x64, 0144 (octal) or $NODEID+0x64")
+    bits = 8 * kind.size
+    signed = kind in (Kind.I8, Kind.I16, Kind.I32)
+    least, greatest = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
+    if entry.kind == _BOOLEAN:
+        greatest = 1
+
+    def held(number: int) -> int:
+        return number - (1 << bits) if signed and 1 << bits - 1 <= number < 1 << bits else number
+
+    value, of = held(value) if entry.hexadecimal else value, "its type"
+    limits = [None if one is None else held(one) for one in (entry.low, entry.high)]
+    # Files have limits that no value can fit; those of what is not written here do not matter.
+    low, high = (bound if one is None else one for one, bound in zip(limits, (least, greatest), strict=True))
+    if key >> 8 not in _OURS and least <= low < high <= greatest and (low, high) != (least, greatest):
+        least, greatest, of = low, high, "the file's LowLimit and HighLimit"
+    if not least <= value <= greatest:
+        raise ValueError(f"{where(Entry(key >> 8, key & 0xFF, kind, ''))} holds {least} to {greatest}, by {of}")
+    return value
 
 
 def _require_off(objects: Objects) -> None:

@@ -9,7 +9,10 @@ import pytest
 from helpers.emulated_arms import weightless_config
 from helpers.makers import SHEETS, Bench, arm_of, sheet
 
+from drivers.can.can_link import Link
 from drivers.canopen import object_dictionary as od
+from ident_service.config.arm import ArmConfig
+from ident_service.config.eds import DataSheetEntry
 from ident_service.config.quantities import TextFile
 from ident_service.errors import DriverError, UsageError
 from ident_service.operations.drive_configuration import (
@@ -25,7 +28,7 @@ EPOS4 = "maxon_epos4_50-8_0110h.eds"
 NOMINAL, GAIN, RATED = "3001sub1", "30A0sub1", "6076"
 
 
-def dcf(**values: int) -> TextFile:
+def dcf(**values: int | str) -> TextFile:
     """An EDS as its maker's tool would write it for one drive, with these values."""
     text = sheet(EPOS4)["text"]
     for name, value in values.items():
@@ -107,6 +110,58 @@ def test_files_that_configure_nothing_are_refused() -> None:
         import_configuration(config, [TextFile(name="a.eds", text="x")] * 2, dry=True)
 
 
+def no_bus(config: ArmConfig) -> list[Link]:
+    raise AssertionError("a file was refused only after a bus had been opened")
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("99999999999", "6065h holds 0 to 4294967295, by its type"),
+        ("0x100000000", "6065h holds 0 to 4294967295, by its type"),
+        ("-1", "6065h holds 0 to 4294967295, by its type"),
+        *(
+            (text, "is no whole number; write 100, 0x64")
+            for text in ("1e5", "abc", "12.5", "1F4h", "08", "1 2", "9" * 5000)
+        ),
+    ],
+)
+def test_a_value_that_an_entry_cannot_hold_is_refused_before_any_drive_is_asked(text: str, why: str) -> None:
+    config, files = arm_of(EPOS4), [dcf(**{NOMINAL: 4000}), dcf(**{GAIN: 77, "6065": text})]
+    for dry in (True, False):
+        with pytest.raises(UsageError) as told:
+            import_configuration(config, files, dry=dry, open_bus=no_bus)
+        assert f"drive.dcf: [6065] ParameterValue={text[:40]}: {why}" in str(told.value)
+        assert str(told.value).endswith("; nothing was written")
+
+
+def test_every_wrong_value_counts_and_limits_of_the_file_too() -> None:
+    config = arm_of(EPOS4)
+    texts = {"6098": "128", "60FF": "3000000000", NOMINAL: "4294967295", GAIN: "x", "6065": "y"}
+    with pytest.raises(UsageError, match=r"\[3001sub1\].*\[30A0sub1\].*\[6065\].*; and 2 more; nothing was written"):
+        import_configuration(config, [dcf(**texts)] * 2, dry=True, open_bus=no_bus)
+    for text in ("8001", "-1"):
+        with pytest.raises(
+            UsageError, match=rf"={text}: 3001h:01 holds 0 to 8000, by the file's LowLimit and HighLimit; nothing"
+        ):
+            import_configuration(config, [dcf(**{NOMINAL: text})] * 2, dry=True, open_bus=no_bus)
+
+
+def test_numbers_are_read_as_the_standard_writes_them() -> None:
+    numbers = {"10": 10, "+5": 5, "-3": -3, "0": 0, "0xA": 10, "0XaB": 171, "017": 15, "-0x5": -5}
+    relative = {"$NODEID": 3, "$NODEID+0x200": 0x203, "0x200 + $NODEID": 0x203, "$nodeid+10": 13}
+    others = ("", "0x", "1e5", "08", "12.5", "180h", "$NODEID5", "5$NODEID", "$NODEID-1", "'5'", "１")
+    for text, number in (numbers | relative | dict.fromkeys(others)).items():
+        assert DataSheetEntry(7, text=text).standard_number(3) == number, text
+    config = arm_of(EPOS4)
+    bench = Bench(config)
+    values = {NOMINAL: "$NODEID+0x100", GAIN: "0115", "6083": "0x64", "6098": "0xFF", "60FF": "-5"}
+    found = import_configuration(config, [dcf(**values)] * 2, dry=False, open_bus=bench.links)  # type: ignore[arg-type]
+    assert [len(one.changes) for one in found] == [5, 5]
+    assert (held(bench, 0x3001, 1), held(bench, 0x30A0, 1)) == ([0x101, 0x102], [77, 77])
+    assert [held(bench, index) for index in (0x6083, 0x6098, 0x60FF)] == [[100] * 2, [-1] * 2, [-5] * 2]
+
+
 def test_drives_store_and_restore_what_they_hold() -> None:
     config = arm_of(EPOS4)
     bench = Bench(config)
@@ -164,6 +219,10 @@ def test_the_commands_ask_for_the_arms_name(tmp_path: Path, capsys: pytest.Captu
     from ident_service.cli import USAGE, main
 
     file = tmp_path / "a.dcf"
+    file.write_text(dcf(**{NOMINAL: "1e5"}).text, encoding="latin-1")
+    for how in (["--dry-run"], ["--confirm", "wam7_canopen"]):
+        assert main(["bus", "import", "wam7_canopen", *[str(file)] * 7, *how]) == USAGE
+        assert "a.dcf: [3001sub1] ParameterValue=1e5: is no whole number" in capsys.readouterr().err
     file.write_text(dcf(**{NOMINAL: 4000}).text, encoding="latin-1")
     for words in (["import", "wam7_canopen", str(file)], ["store", "wam7_canopen"], ["restore", "wam7_canopen"]):
         for more in ([], ["--confirm", "other"]):
