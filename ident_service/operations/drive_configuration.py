@@ -11,7 +11,7 @@ so, and only while they are off.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -186,7 +186,8 @@ def import_configuration(
 ) -> tuple[ImportedDrive, ...]:
     """Write the values that DCFs give to drives, one file for each drive in the arm's order.
 
-    A drive that refuses one of them, or keeps another value, is set back to what it held, and so are those before it.
+    A drive that refuses one of them, or keeps another value, is set back to what it held, and so are those before it;
+    so are all after an interrupt or any other error. The error says so, itself or in a note.
 
     Args:
         config: of the arm.
@@ -198,7 +199,7 @@ def import_configuration(
         UsageError: no CANopen drives, not a file each, or a file that configures nothing, or has a value that is no
             number or that its entry cannot hold; no bus has been opened.
         DriverError: a bus is in use, or lost; a drive is on, or another than the file's; nothing has been written. Or
-            values could not be set back: the message names them.
+            an entry was refused, or the import interrupted; values that could not be set back are named.
     """
     driver = require_drives(config)
     if len(files) != len(driver.drives):
@@ -213,23 +214,26 @@ def import_configuration(
             _require_off(objects)
             _require_same(file, objects)
         done: list[ImportedDrive] = []
-        for number, (file, objects, writes) in enumerate(zip(files, every, wanted, strict=True), 1):
-            changes: list[Change] = []
-            ours = {key for key in writes if key >> 8 in _OURS}
-            try:
+        touched: list[tuple[Objects, list[Change]]] = []
+        try:
+            for number, (file, objects, writes) in enumerate(zip(files, every, wanted, strict=True), 1):
+                changes: list[Change] = []
+                touched.append((objects, changes))
+                ours = {key for key in writes if key >> 8 in _OURS}
                 for key, write in writes.items():
                     if key not in ours and not objects.holds(write):
                         changes.append(Change(write.entry, objects.read(write.entry), write.value))
                         objects.set(write)
-            except BusError:
-                raise
-            except DriverError as error:
-                back = [*zip(every, (one.changes for one in done), strict=False), (objects, changes)]
-                lost = [words for who, made in reversed(back) for words in _set_back(who, made)]
-                end = f"; NOT set back: {', '.join(lost)}" if lost else "; every drive holds again what it held"
-                raise DriverError(f"{error}{end}") from None
-            same = len(writes) - len(ours) - len(changes)
-            done.append(ImportedDrive(number, objects.node, file.name, tuple(changes), same, len(ours)))
+                same = len(writes) - len(ours) - len(changes)
+                done.append(ImportedDrive(number, objects.node, file.name, tuple(changes), same, len(ours)))
+        except BaseException as error:  # an interrupt, or a mistake here, leaves no drive half-configured either
+            end = _all_set_back(touched)
+            if isinstance(error, KeyboardInterrupt):
+                raise DriverError(f"interrupted; {end}") from None
+            if isinstance(error, DriverError) and not isinstance(error, BusError):
+                raise DriverError(f"{error}; {end}") from None
+            error.add_note(end)
+            raise
     return tuple(done)
 
 
@@ -291,15 +295,29 @@ def _require_same(file: TextFile, objects: Objects) -> None:
             raise DriverError(f"node {objects.node}: {name} is {held:08X}h, but {file.name} is for {sheet[sub]:08X}h")
 
 
-def _set_back(objects: Objects, changes: Sequence[Change]) -> list[str]:
-    lost = []
-    for change in reversed(changes):
-        try:
-            if change.before is not None and not objects.dry:
-                objects.ensure(Write(change.entry, change.before))
-        except DriverError:
-            lost.append(f"node {objects.node} {where(change.entry)}")
-    return lost
+def _all_set_back(touched: Sequence[tuple[Objects, Sequence[Change]]]) -> str:
+    """Set drives back to what they held before these changes, the last one first; return the outcome in words."""
+    if not any(changes and not objects.dry for objects, changes in touched):
+        return "nothing was written"
+    lost = [
+        f"node {objects.node} {where(change.entry)}"
+        for objects, changes in reversed(touched)
+        for change in reversed(changes)
+        if not _is_set_back(objects, change)
+    ]
+    return f"NOT set back: {', '.join(lost)}" if lost else "every drive holds again what it held"
+
+
+def _is_set_back(objects: Objects, change: Change) -> bool:
+    if change.before is None:
+        return False
+    for _ in range(2):
+        with suppress(Exception, KeyboardInterrupt):  # whatever it is, the others have to be set back too
+            objects.ensure(Write(change.entry, change.before))
+            return True
+        with suppress(Exception, KeyboardInterrupt):
+            objects.discard_answers()  # that of a request which was interrupted, for one
+    return False
 
 
 def store_or_restore(

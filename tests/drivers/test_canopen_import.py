@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import re
+import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from helpers.emulated_arms import weightless_config
 from helpers.makers import SHEETS, Bench, arm_of, sheet
 
+from drivers.can.bus_state import BusError
+from drivers.can.can_frame import Frame
 from drivers.can.can_link import Link
 from drivers.canopen import object_dictionary as od
 from ident_service.config.arm import ArmConfig
@@ -74,6 +78,75 @@ def test_a_refused_entry_sets_every_drive_back() -> None:
     with pytest.raises(DriverError, match=r"node 2: setting 30A0h.*every drive holds again what it held"):
         import_configuration(config, [dcf(**{NOMINAL: 4000, GAIN: 77})] * 2, dry=False, open_bus=bench.links)  # type: ignore[arg-type]
     assert (held(bench, 0x3001, 1), held(bench, 0x30A0, 1)) == before
+
+
+def broken_at_the_last(bench: Bench, error: BaseException, times: int) -> Callable[[ArmConfig], list[Link]]:
+    """Taps where waiting for the answer to the last drive's second value ends so; the answer still comes later."""
+
+    def links(config: ArmConfig) -> list[Link]:
+        (tap,) = taps = bench.links(config)
+        receive, left = tap.receive, [times]
+
+        def broken(deadline_ns: int) -> Frame | None:
+            last, now = struct.pack("<HB", 0x30A0, 1), tap.sent[-1] if tap.sent else None
+            reached = now is not None and (now.identifier, now.data[0] >> 5, now.data[1:4]) == (0x602, 1, last)
+            if left[0] and (reached or left[0] < times):
+                left[0] -= 1
+                raise error
+            return receive(deadline_ns)
+
+        tap.receive = broken  # type: ignore[method-assign]
+        return taps  # type: ignore[return-value]
+
+    return links
+
+
+@pytest.mark.parametrize("times", [1, 2])
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        (KeyboardInterrupt, ()),
+        (ValueError, ("a mistake",)),
+        (BusError, ("full", "can0")),
+        (DriverError, ("something",)),
+    ],
+)
+def test_whatever_ends_an_import_sets_every_drive_back_and_is_told(
+    kind: type[BaseException], words: tuple[str, ...], times: int
+) -> None:
+    error, interrupted = kind(*words), kind is KeyboardInterrupt
+    config = arm_of(EPOS4)
+    bench = Bench(config)
+    before = held(bench, 0x3001, 1), held(bench, 0x30A0, 1)
+    files = [dcf(**{NOMINAL: 4000, GAIN: 77})] * 2
+    with pytest.raises(DriverError if interrupted else kind) as told:
+        import_configuration(config, files, dry=False, open_bus=broken_at_the_last(bench, error, times))
+    assert len({place for place in bench.downloads() if place[0] == 1}) == 2  # the first drive had been written
+    assert (held(bench, 0x3001, 1), held(bench, 0x30A0, 1)) == before
+    said = "; ".join([str(told.value), *getattr(told.value, "__notes__", ())])
+    assert said.endswith("; every drive holds again what it held")
+    assert said.startswith("interrupted" if interrupted else str(error))
+
+
+def test_what_a_lost_bus_leaves_changed_is_named() -> None:
+    config = arm_of(EPOS4)
+    bench = Bench(config)
+    lost = broken_at_the_last(bench, BusError("gone", "can0"), 1000)
+    with pytest.raises(BusError) as told:
+        import_configuration(config, [dcf(**{NOMINAL: 4000, GAIN: 77})] * 2, dry=False, open_bus=lost)
+    changed = ", ".join(f"node {node} {entry}" for node in (2, 1) for entry in ("30A0h:01", "3001h:01"))
+    assert told.value.__notes__ == [f"NOT set back: {changed}"]
+    assert held(bench, 0x3001, 1) == [4000, 4000]
+
+
+def test_nothing_is_said_to_be_set_back_where_nothing_was_written() -> None:
+    config = arm_of(EPOS4)
+    bench = Bench(config)
+    del bench.behind.emulator.faces[1].objects.entries[0x30A001]  # type: ignore[attr-defined]
+    for dry, values in ((True, {NOMINAL: 4000, GAIN: 77}), (False, {GAIN: held(bench, 0x30A0, 1)[0]})):
+        with pytest.raises(DriverError, match=r"node 2: reading 30A0h.*; nothing was written$"):
+            import_configuration(config, [dcf(**values)] * 2, dry=dry, open_bus=bench.links)  # type: ignore[arg-type]
+        assert bench.downloads() == []
 
 
 def test_a_drive_that_is_on_or_another_is_not_touched() -> None:
