@@ -31,7 +31,7 @@ from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.eds import DataSheet, DataSheetEntry, data_sheet
 from ident_service.config.quantities import TextFile
-from ident_service.errors import DriverError, UsageError
+from ident_service.errors import DriverError, FileCutOff, UsageError
 
 
 @dataclass(frozen=True)
@@ -198,6 +198,7 @@ def import_configuration(
     Raises:
         UsageError: no CANopen drives, not a file each, or a file that configures nothing, or has a value that is no
             number or that its entry cannot hold; no bus has been opened.
+        FileCutOff: the end of a file is missing, with other values maybe; no bus has been opened.
         DriverError: a bus is in use, or lost; a drive is on, or another than the file's; nothing has been written. Or
             an entry was refused, or the import interrupted; values that could not be set back are named.
     """
@@ -238,8 +239,17 @@ def import_configuration(
 
 
 def _configured(file: TextFile, node: int) -> dict[int, Write]:
-    """Return the values that a DCF gives to its drive, by key; raises UsageError for a wrong one, or for none."""
+    """Return the values that a DCF gives to its drive, by key.
+
+    Raises:
+        UsageError: one is wrong, or there are none.
+        FileCutOff: further ones may be missing.
+    """
     sheet = data_sheet(file.text)
+    if sheet.cut_off:
+        raise FileCutOff(
+            f"{file.name} seems to end too early: {sheet.cut_off}; get the whole file; nothing was written"
+        )
     found, wrong = {}, []
     for key, entry in sorted(sheet.entries.items()):
         kind = _NUMBERS.get(entry.kind)

@@ -15,10 +15,11 @@ from drivers.can.bus_state import BusError
 from drivers.can.can_frame import Frame
 from drivers.can.can_link import Link
 from drivers.canopen import object_dictionary as od
+from ident_service.cli import USAGE, VERDICT_NO, main
 from ident_service.config.arm import ArmConfig
 from ident_service.config.eds import DataSheetEntry
 from ident_service.config.quantities import TextFile
-from ident_service.errors import DriverError, UsageError
+from ident_service.errors import DriverError, FileCutOff, UsageError
 from ident_service.operations.drive_configuration import (
     drives_document,
     import_configuration,
@@ -235,6 +236,23 @@ def test_numbers_are_read_as_the_standard_writes_them() -> None:
     assert [held(bench, index) for index in (0x6083, 0x6098, 0x60FF)] == [[100] * 2, [-1] * 2, [-5] * 2]
 
 
+def test_a_file_that_is_cut_off_is_refused_as_by_a_probe(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config, whole = arm_of(EPOS4), dcf(**{NOMINAL: 4000})
+    half = TextFile(name="half.dcf", text=whole.text[: len(whole.text) * 7 // 10])
+    told = r"^half.dcf seems to end too early: of 127 announced objects \d+ are missing; .*nothing was written$"
+    for dry in (True, False):
+        with pytest.raises(FileCutOff, match=told):
+            import_configuration(config, [whole, half], dry=dry, open_bus=no_bus)
+    file = tmp_path / "half.dcf"
+    file.write_text(half.text, encoding="latin-1")
+    for words in (
+        ["probe", "wam7_canopen", "--eds", str(file)],
+        ["import", "wam7_canopen", *[str(file)] * 7, "--dry-run"],
+    ):
+        assert main(["bus", *words]) == VERDICT_NO
+        assert "seems to end too early: of 127 announced objects" in "".join(capsys.readouterr())
+
+
 def test_drives_store_and_restore_what_they_hold() -> None:
     config = arm_of(EPOS4)
     bench = Bench(config)
@@ -289,8 +307,6 @@ def test_a_zero_that_must_be_lost_with_power_is_not_stored_and_what_is_lacking_i
 
 
 def test_the_commands_ask_for_the_arms_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from ident_service.cli import USAGE, main
-
     file = tmp_path / "a.dcf"
     file.write_text(dcf(**{NOMINAL: "1e5"}).text, encoding="latin-1")
     for how in (["--dry-run"], ["--confirm", "wam7_canopen"]):
