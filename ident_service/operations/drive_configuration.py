@@ -10,7 +10,7 @@ so, and only while they are off.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
@@ -142,6 +142,9 @@ def require_drives(config: ArmConfig, why: str = "only CANopen drives are config
 
 _NUMBERS = {1: Kind.U8, 2: Kind.I8, 3: Kind.I16, 4: Kind.I32, 5: Kind.U8, 6: Kind.U16, 7: Kind.U32}  # CiA 301, table 44
 _BOOLEAN = 1
+# Those of the other types whose names people know.
+_TYPES = {0x08: "REAL32", 0x09: "VISIBLE_STRING", 0x0A: "OCTET_STRING", 0x0B: "UNICODE_STRING", 0x0F: "DOMAIN"}
+_TYPES |= {0x11: "REAL64", 0x15: "INTEGER64", 0x1B: "UNSIGNED64"}
 _SHOWN = 3  # mistakes of a file that are told
 _IDENTITY = {"vendor": (od.VENDOR, 1), "product": (od.PRODUCT, 2)}
 # Of the host, at every opening or in every cycle.
@@ -167,6 +170,7 @@ class ImportedDrive:
         changes: changes that were written, or would be.
         same: number of entries that had their value already.
         left: number of entries that are left to opening, which sets them.
+        left_out: entries whose value in the DCF cannot be imported, and why, in words.
     """
 
     drive: int
@@ -175,6 +179,7 @@ class ImportedDrive:
     changes: tuple[Change, ...]
     same: int
     left: int
+    left_out: Mapping[str, str]
 
 
 def import_configuration(
@@ -206,6 +211,7 @@ def import_configuration(
     if len(files) != len(driver.drives):
         raise UsageError(f"{len(files)} files for {len(driver.drives)} drives; give one DCF for each, in their order")
     wanted = [_configured(file, drive.node) for file, drive in zip(files, driver.drives, strict=True)]
+    left_out = [_left_out(file) for file in files]
     with asking(config, open_bus) as (_, links, heard):
         every = [
             (DryRunObjects if dry else Objects)(links[one.bus], one.node, hearing(heard, one.bus))
@@ -226,7 +232,8 @@ def import_configuration(
                         changes.append(Change(write.entry, objects.read(write.entry), write.value))
                         objects.set(write)
                 same = len(writes) - len(ours) - len(changes)
-                done.append(ImportedDrive(number, objects.node, file.name, tuple(changes), same, len(ours)))
+                outcome = tuple(changes), same, len(ours), left_out[number - 1]
+                done.append(ImportedDrive(number, objects.node, file.name, *outcome))
         except BaseException as error:  # an interrupt, or a mistake here, leaves no drive half-configured either
             end = _all_set_back(touched)
             if isinstance(error, KeyboardInterrupt):
@@ -264,8 +271,34 @@ def _configured(file: TextFile, node: int) -> dict[int, Write]:
         raise UsageError(f"{file.name}: {'; '.join(wrong[:_SHOWN])}{more}; nothing was written")
     if not found:
         why = sheet.mistake or "no entry has a ParameterValue; an EDS describes a kind of drive, a DCF configures one"
+        if left_out := _left_out(file):
+            why = f"none of its values can be imported: {_listed(left_out)}"
         raise UsageError(f"{file.name}: configures no drive: {why}")
     return found
+
+
+def _left_out(file: TextFile) -> dict[str, str]:
+    """Return the entries whose value in a DCF cannot be imported, and why."""
+    found = {}
+    for key, entry in sorted(data_sheet(file.text).entries.items()):
+        if not entry.place or key >> 8 in _OURS:
+            continue
+        name = where(Entry(key >> 8, key & 0xFF, Kind.U32, ""))
+        if not entry.writable:
+            found[name] = "read-only"
+        elif entry.kind not in _NUMBERS:
+            found[name] = f"{_TYPES.get(entry.kind, f'type {entry.kind:04X}h')} is not imported"
+        elif not entry.configured:
+            found[name] = "of a node number, which is the drive's own"
+    return found
+
+
+def _listed(left_out: Mapping[str, str]) -> str:
+    """Return entries with their reasons, in words, those of one reason together."""
+    why: dict[str, list[str]] = {}
+    for name, reason in left_out.items():
+        why.setdefault(reason, []).append(name)
+    return "; ".join(f"{', '.join(names)} ({reason})" for reason, names in why.items())
 
 
 def _value(key: int, entry: DataSheetEntry, kind: Kind, node: int) -> int:
@@ -385,6 +418,7 @@ def imported_text(config: ArmConfig, found: Sequence[ImportedDrive], *, dry: boo
     for one in found:
         lines += ["", f"drive {one.drive}, node {one.node}, by {one.file}: {len(one.changes)} entries changed"]
         lines += [*_change_lines(one.changes)]
+        lines += [f"  {'left out':<16}{_listed(one.left_out)}"] if one.left_out else []
         lines.append(f"  {one.same} had their value already; {one.left} are set whenever the arm is opened")
     return "\n".join(lines) + "\n"
 

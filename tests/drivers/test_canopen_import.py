@@ -33,9 +33,9 @@ EPOS4 = "maxon_epos4_50-8_0110h.eds"
 NOMINAL, GAIN, RATED = "3001sub1", "30A0sub1", "6076"
 
 
-def dcf(**values: int | str) -> TextFile:
+def dcf(text: str = "", **values: int | str) -> TextFile:
     """An EDS as its maker's tool would write it for one drive, with these values."""
-    text = sheet(EPOS4)["text"]
+    text = text or sheet(EPOS4)["text"]
     for name, value in values.items():
         text, count = re.subn(rf"(?im)^(\[{name}\]\r?\n)", rf"\g<1>ParameterValue={value}\n", text)
         assert count == 1, name
@@ -219,6 +219,26 @@ def test_every_wrong_value_counts_and_limits_of_the_file_too() -> None:
             UsageError, match=rf"={text}: 3001h:01 holds 0 to 8000, by the file's LowLimit and HighLimit; nothing"
         ):
             import_configuration(config, [dcf(**{NOMINAL: text})] * 2, dry=True, open_bus=no_bus)
+
+
+def test_a_value_that_cannot_be_imported_is_named() -> None:
+    config = arm_of(EPOS4)
+    own = {"6041": "7", "6502": "x", "1018sub4": "9"}  # read-only; the last is compared by hosts, and never written
+    own |= {"21A0sub1": "1.5", "21A0sub2": "a drive", "21A0sub3": "0x500"}
+    text = sheet(EPOS4)["text"]
+    for number, kind, default in ((1, "0x8", "0"), (2, "0x9", ""), (3, "0x7", "$NODEID+0x400")):
+        text += f"\n[21A0sub{number}]\nDataType={kind}\nAccessType=rw\nDefaultValue={default}\n"
+    files = [dcf(text, **{NOMINAL: 4000}, **own)] * 2
+    bench = Bench(config)
+    for dry in (True, False):
+        found = import_configuration(config, files, dry=dry, open_bus=bench.links)  # type: ignore[arg-type]
+        assert list(found[1].left_out) == ["21A0h:01", "21A0h:02", "21A0h:03", "6041h", "6502h"]
+        text = imported_text(config, found, dry=dry)
+        assert "  left out        21A0h:01 (REAL32 is not imported); 21A0h:02 (VISIBLE_STRING is" in text
+        assert "21A0h:03 (of a node number, which is the drive's own); 6041h, 6502h (read-only)\n" in text
+        assert drives_document(config, found)["drives"][0]["left_out"]["6041h"] == "read-only"
+    with pytest.raises(UsageError, match=r"none of its values can be imported: 6041h \(read-only\)$"):
+        import_configuration(config, [dcf(**{"6041": 7})] * 2, dry=True, open_bus=no_bus)
 
 
 def test_numbers_are_read_as_the_standard_writes_them() -> None:
