@@ -6,6 +6,7 @@
     ├── UsageError (ValueError)        invalid command or call: missing file, contradictory options
     │   ├── UnknownId (LookupError)    an id that the registry does not have
     │   ├── AlreadyThere               a name that is taken, and replacement was not requested
+    │   ├── FileCutOff                 a file whose end is missing by what it announces itself
     │   ├── InUse                      something that cannot be deleted because it is in use or referred to
     │   ├── InvalidRequest             a request that the daemon's API rejects
     │   └── AccessRefused              no valid token, or a role without this right
@@ -65,6 +66,10 @@ class UnknownId(UsageError, LookupError):
 
 class AlreadyThere(UsageError):
     """A name is taken, and replacement was not requested."""
+
+
+class FileCutOff(UsageError):
+    """A file can be read, but its end is missing by what it announces itself."""
 
 
 @dataclass(frozen=True)

@@ -116,6 +116,12 @@ class Objects:
                 return
             self._others(frame)
 
+    def discard_answers(self) -> None:
+        """Pass over answers to earlier requests, for as long as one may take to come; raises DriverError."""
+        deadline = self._link.clock.now_ns() + round(self.patience * 1e9)
+        while (frame := self._link.receive(deadline)) is not None:
+            self._others(frame)
+
     def read_bytes(self, index: int, sub: int, name: str) -> bytes:
         """Return the value of an entry as bytes.
 

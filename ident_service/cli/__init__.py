@@ -51,6 +51,7 @@ from ident_service.errors import (
     ArmFault,
     ConfigError,
     DiskFull,
+    FileCutOff,
     IdentError,
     ModelError,
     MotionRefused,
@@ -83,7 +84,7 @@ GROUPS = {
 _BAD_INPUT: tuple[type[IdentError], ...] = (UsageError, ConfigError, ModelError, RecordingError, ParameterError)
 _EXIT_CODES: tuple[tuple[type[IdentError] | tuple[type[IdentError], ...], int], ...] = (
     (RecordingNotWritten, FAILED),
-    (MustNotBeUsed, VERDICT_NO),
+    ((MustNotBeUsed, FileCutOff), VERDICT_NO),
     (_BAD_INPUT, USAGE),
     (PersonNeeded, PERSON_NEEDED),
     (MotionRefused, VERDICT_NO),

@@ -322,7 +322,7 @@ def _add_bus(verbs: VerbList) -> None:
         "import",
         _import,
         "write what DCFs of the maker's tool configure",
-        more="One file for each drive; each change is listed, and drives are off meanwhile.",
+        more="One file for each drive; changes are listed, drives off meanwhile (exit code 3: a file is cut off).",
         examples=("my_arm.yaml j1.dcf j2.dcf --dry-run", "my_arm.yaml j1.dcf j2.dcf --confirm my_arm"),
     )
     add_arm(sub)

@@ -20,6 +20,13 @@ _REMARK = re.compile(r"\s;")
 _NODE = re.compile(r"\$?NODE-?ID", re.IGNORECASE)
 _OCTAL = re.compile(r"-?0[0-7]+")
 _BARE_HEXADECIMAL = re.compile(r"([0-9a-f]*[a-f][0-9a-f]*)h?|([0-9a-f]+)h", re.IGNORECASE)  # 1F4, 1F4h
+# As CiA 306-1 has numbers; what is relative to a node number may stand on either side of `+`.
+_DIGITS, _OWN = "0x[0-9a-f]+|0[0-7]*|[1-9][0-9]*", r"\$?NODE-?ID"
+_STANDARD = re.compile(
+    rf"(?P<after>{_OWN})(?:\s*(?P<more>\+\s*(?:{_DIGITS})))?|(?P<plain>[+-]?(?:{_DIGITS}))(?P<before>\s*\+\s*{_OWN})?",
+    re.IGNORECASE,
+)
+_LONGEST_NUMBER = 100  # characters, leading zeros included
 _LARGEST = 2**64  # which no number of an object dictionary reaches
 _MOST_ENTRIES = 2**17
 _UNSIGNED8, _UNSIGNED16, _UNSIGNED32 = 0x05, 0x06, 0x07  # data types (CiA 301, table 44)
@@ -44,6 +51,7 @@ class DataSheetEntry:
         high: greatest value, likewise.
         text: value in the file's own words, None where it says none; that of a DCF before the default.
         configured: whether the value is one which a DCF gives to this drive, not the default of its kind.
+        place: section and key of the value that a DCF gives, as `[6083] ParameterValue`; empty where it gives none.
     """
 
     kind: int
@@ -53,6 +61,7 @@ class DataSheetEntry:
     high: int | None = None
     text: str | None = None
     configured: bool = False
+    place: str = ""
 
     @property
     def writable(self) -> bool:
@@ -66,6 +75,24 @@ class DataSheetEntry:
             node: node number that COB-IDs are relative to.
         """
         return None if self.text is None else _number(self.text, node)
+
+    def standard_number(self, node: int) -> int | None:
+        """Return the entry's value as `number`, but only of the notations of CiA 306-1: 10, 017, 0xA, $NODEID+0xA.
+
+        What is written otherwise has no certain meaning: is 1e5 a hundred thousand, or 485?
+        """
+        match = _STANDARD.fullmatch(self.text or "") if len(self.text or "") <= _LONGEST_NUMBER else None
+        if match is None:
+            return None
+        digits = "".join((match["more"] or match["plain"] or "0").split()).lower()
+        plain = digits.lstrip("+-")
+        base = 16 if plain.startswith("0x") else 8 if plain.startswith("0") else 10
+        return int(digits, base) + (node if match["after"] or match["before"] else 0)
+
+    @property
+    def hexadecimal(self) -> bool:
+        """Return whether the value stands as hexadecimal digits, which may be those of a negative number."""
+        return "0x" in (self.text or "").lower()
 
 
 @dataclass(frozen=True)
@@ -105,7 +132,7 @@ def data_sheet(text: str) -> DataSheet:
         if sub is None and _is_container(section, index in divided):
             continue
         values = sections.get(f"{index:04x}value", {})
-        entries.update((index << 8 | at, one) for at, one in _listed(section, sub or 0, values))
+        entries.update((index << 8 | at, one) for at, one in _listed(section, index, sub, values))
         if len(entries) > _MOST_ENTRIES:
             return DataSheet(mistake=f"it lists more than {_MOST_ENTRIES} entries")
     info: Mapping[str, str] = sections.get("deviceinfo", {})
@@ -169,7 +196,9 @@ def _is_container(section: Mapping[str, str], divided: bool) -> bool:
     return (divided and "datatype" not in section) or (kind is None and bool(subs))
 
 
-def _listed(section: Mapping[str, str], sub: int, values: Mapping[str, str]) -> Iterator[tuple[int, DataSheetEntry]]:
+def _listed(
+    section: Mapping[str, str], index: int, sub: int | None, values: Mapping[str, str]
+) -> Iterator[tuple[int, DataSheetEntry]]:
     """Yield the entries of one section: one, or all elements of a compact array, with those of its values in a DCF."""
     text = section.get("defaultvalue") or None
     own = section.get("parametervalue") or None
@@ -179,14 +208,17 @@ def _listed(section: Mapping[str, str], sub: int, values: Mapping[str, str]) -> 
     kind = _number(section.get("datatype", ""), 0) or 0
     access = section.get("accesstype", "ro").strip().lower()
     mappable, configured = _is_set(section.get("pdomapping", "")), own is not None and text is own
-    found = DataSheetEntry(kind, access, mappable, low, high, text, configured)
+    name = f"{index:04X}" if sub is None else f"{index:04X}sub{sub:X}"
+    place = "" if own is None else f"[{name}] ParameterValue"
+    found = DataSheetEntry(kind, access, mappable, low, high, text, configured, place)
     if (many := min(_number(section.get("compactsubobj", ""), 0) or 0, _MOST_SUBS)) > 0:
         yield 0, DataSheetEntry(_UNSIGNED8, text=str(many))
         for number in range(1, many + 1):
             own = values.get(str(number)) or None
-            yield number, found if own is None else replace(found, text=own, configured=True)
+            place = f"[{index:04X}Value] {number}"
+            yield number, found if own is None else replace(found, text=own, configured=True, place=place)
     else:
-        yield sub, found
+        yield sub or 0, found
 
 
 def _compact_pdos(info: Mapping[str, str]) -> dict[int, DataSheetEntry]:

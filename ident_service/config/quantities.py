@@ -151,9 +151,11 @@ def _read(value: Any, info: ValidationInfo, decode: Callable[[bytes], str]) -> A
         )
     path = folder / value
     try:
-        there = path.is_file()
+        there, is_folder = path.is_file(), path.is_dir()
     except OSError:  # for example, the name is too long
-        there = False
+        there = is_folder = False
+    if is_folder:
+        raise ValueError(f"{path} is a folder; name a file in it")
     if not there:
         raise ValueError(f"no such file: {path}; give its path as seen from the description's folder")
     if path.stat().st_size > MAX_FILE_BYTES:

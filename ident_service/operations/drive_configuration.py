@@ -10,8 +10,8 @@ so, and only while they are off.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,9 +29,9 @@ from drivers.canopen.sdo import Change, DryRunObjects, Objects, optional
 from drivers.canopen.stored_zero import zeros_of
 from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanopenDriver
-from ident_service.config.eds import DataSheet, data_sheet
+from ident_service.config.eds import DataSheet, DataSheetEntry, data_sheet
 from ident_service.config.quantities import TextFile
-from ident_service.errors import DriverError, UsageError
+from ident_service.errors import DriverError, FileCutOff, UsageError
 
 
 @dataclass(frozen=True)
@@ -141,6 +141,11 @@ def require_drives(config: ArmConfig, why: str = "only CANopen drives are config
 
 
 _NUMBERS = {1: Kind.U8, 2: Kind.I8, 3: Kind.I16, 4: Kind.I32, 5: Kind.U8, 6: Kind.U16, 7: Kind.U32}  # CiA 301, table 44
+_BOOLEAN = 1
+# Those of the other types whose names people know.
+_TYPES = {0x08: "REAL32", 0x09: "VISIBLE_STRING", 0x0A: "OCTET_STRING", 0x0B: "UNICODE_STRING", 0x0F: "DOMAIN"}
+_TYPES |= {0x11: "REAL64", 0x15: "INTEGER64", 0x1B: "UNSIGNED64"}
+_SHOWN = 3  # mistakes of a file that are told
 _IDENTITY = {"vendor": (od.VENDOR, 1), "product": (od.PRODUCT, 2)}
 # Of the host, at every opening or in every cycle.
 _OURS = frozenset(
@@ -165,6 +170,7 @@ class ImportedDrive:
         changes: changes that were written, or would be.
         same: number of entries that had their value already.
         left: number of entries that are left to opening, which sets them.
+        left_out: entries whose value in the DCF cannot be imported, and why, in words.
     """
 
     drive: int
@@ -173,6 +179,7 @@ class ImportedDrive:
     changes: tuple[Change, ...]
     same: int
     left: int
+    left_out: Mapping[str, str]
 
 
 def import_configuration(
@@ -184,7 +191,8 @@ def import_configuration(
 ) -> tuple[ImportedDrive, ...]:
     """Write the values that DCFs give to drives, one file for each drive in the arm's order.
 
-    A drive that refuses one of them, or keeps another value, is set back to what it held, and so are those before it.
+    A drive that refuses one of them, or keeps another value, is set back to what it held, and so are those before it;
+    so are all after an interrupt or any other error. The error says so, itself or in a note.
 
     Args:
         config: of the arm.
@@ -193,14 +201,17 @@ def import_configuration(
         open_bus: function that opens the links, in the order of the buses.
 
     Raises:
-        UsageError: no CANopen drives, not a file each, or a file that configures nothing.
+        UsageError: no CANopen drives, not a file each, or a file that configures nothing, or has a value that is no
+            number or that its entry cannot hold; no bus has been opened.
+        FileCutOff: the end of a file is missing, with other values maybe; no bus has been opened.
         DriverError: a bus is in use, or lost; a drive is on, or another than the file's; nothing has been written. Or
-            values could not be set back: the message names them.
+            an entry was refused, or the import interrupted; values that could not be set back are named.
     """
     driver = require_drives(config)
     if len(files) != len(driver.drives):
         raise UsageError(f"{len(files)} files for {len(driver.drives)} drives; give one DCF for each, in their order")
     wanted = [_configured(file, drive.node) for file, drive in zip(files, driver.drives, strict=True)]
+    left_out = [_left_out(file) for file in files]
     with asking(config, open_bus) as (_, links, heard):
         every = [
             (DryRunObjects if dry else Objects)(links[one.bus], one.node, hearing(heard, one.bus))
@@ -210,41 +221,108 @@ def import_configuration(
             _require_off(objects)
             _require_same(file, objects)
         done: list[ImportedDrive] = []
-        for number, (file, objects, writes) in enumerate(zip(files, every, wanted, strict=True), 1):
-            changes: list[Change] = []
-            ours = {key for key in writes if key >> 8 in _OURS}
-            try:
+        touched: list[tuple[Objects, list[Change]]] = []
+        try:
+            for number, (file, objects, writes) in enumerate(zip(files, every, wanted, strict=True), 1):
+                changes: list[Change] = []
+                touched.append((objects, changes))
+                ours = {key for key in writes if key >> 8 in _OURS}
                 for key, write in writes.items():
                     if key not in ours and not objects.holds(write):
                         changes.append(Change(write.entry, objects.read(write.entry), write.value))
                         objects.set(write)
-            except BusError:
-                raise
-            except DriverError as error:
-                back = [*zip(every, (one.changes for one in done), strict=False), (objects, changes)]
-                lost = [words for who, made in reversed(back) for words in _set_back(who, made)]
-                end = f"; NOT set back: {', '.join(lost)}" if lost else "; every drive holds again what it held"
-                raise DriverError(f"{error}{end}") from None
-            same = len(writes) - len(ours) - len(changes)
-            done.append(ImportedDrive(number, objects.node, file.name, tuple(changes), same, len(ours)))
+                same = len(writes) - len(ours) - len(changes)
+                outcome = tuple(changes), same, len(ours), left_out[number - 1]
+                done.append(ImportedDrive(number, objects.node, file.name, *outcome))
+        except BaseException as error:  # an interrupt, or a mistake here, leaves no drive half-configured either
+            end = _all_set_back(touched)
+            if isinstance(error, KeyboardInterrupt):
+                raise DriverError(f"interrupted; {end}") from None
+            if isinstance(error, DriverError) and not isinstance(error, BusError):
+                raise DriverError(f"{error}; {end}") from None
+            error.add_note(end)
+            raise
     return tuple(done)
 
 
 def _configured(file: TextFile, node: int) -> dict[int, Write]:
-    """Return the values that a DCF gives to its drive, by key; raises UsageError where there are none."""
+    """Return the values that a DCF gives to its drive, by key.
+
+    Raises:
+        UsageError: one is wrong, or there are none.
+        FileCutOff: further ones may be missing.
+    """
     sheet = data_sheet(file.text)
-    found = {}
+    if sheet.cut_off:
+        raise FileCutOff(
+            f"{file.name} seems to end too early: {sheet.cut_off}; get the whole file; nothing was written"
+        )
+    found, wrong = {}, []
     for key, entry in sorted(sheet.entries.items()):
-        kind, value = _NUMBERS.get(entry.kind), entry.number(node)
-        if entry.configured and entry.writable and kind is not None and value is not None:
-            bits = 8 * kind.size
-            signed = kind in (Kind.I8, Kind.I16, Kind.I32)
-            value = value - (1 << bits) if signed and value >= 1 << (bits - 1) else value
-            found[key] = Write(Entry(key >> 8, key & 0xFF, kind, "value of the DCF"), value)
+        kind = _NUMBERS.get(entry.kind)
+        if not entry.configured or not entry.writable or kind is None:
+            continue
+        try:
+            found[key] = Write(Entry(key >> 8, key & 0xFF, kind, "value of the DCF"), _value(key, entry, kind, node))
+        except ValueError as error:
+            wrong.append(f"{entry.place}={(entry.text or '')[:40]}: {error}")
+    if wrong:
+        more = f"; and {len(wrong) - _SHOWN} more" if len(wrong) > _SHOWN else ""
+        raise UsageError(f"{file.name}: {'; '.join(wrong[:_SHOWN])}{more}; nothing was written")
     if not found:
         why = sheet.mistake or "no entry has a ParameterValue; an EDS describes a kind of drive, a DCF configures one"
+        if left_out := _left_out(file):
+            why = f"none of its values can be imported: {_listed(left_out)}"
         raise UsageError(f"{file.name}: configures no drive: {why}")
     return found
+
+
+def _left_out(file: TextFile) -> dict[str, str]:
+    """Return the entries whose value in a DCF cannot be imported, and why."""
+    found = {}
+    for key, entry in sorted(data_sheet(file.text).entries.items()):
+        if not entry.place or key >> 8 in _OURS:
+            continue
+        name = where(Entry(key >> 8, key & 0xFF, Kind.U32, ""))
+        if not entry.writable:
+            found[name] = "read-only"
+        elif entry.kind not in _NUMBERS:
+            found[name] = f"{_TYPES.get(entry.kind, f'type {entry.kind:04X}h')} is not imported"
+        elif not entry.configured:
+            found[name] = "of a node number, which is the drive's own"
+    return found
+
+
+def _listed(left_out: Mapping[str, str]) -> str:
+    """Return entries with their reasons, in words, those of one reason together."""
+    why: dict[str, list[str]] = {}
+    for name, reason in left_out.items():
+        why.setdefault(reason, []).append(name)
+    return "; ".join(f"{', '.join(names)} ({reason})" for reason, names in why.items())
+
+
+def _value(key: int, entry: DataSheetEntry, kind: Kind, node: int) -> int:
+    """Return the value that a DCF gives to an entry; raises ValueError in words where the entry cannot hold it."""
+    if (value := entry.standard_number(node)) is None:
+        raise ValueError("is no whole number; write 100, 0x64, 0144 (octal) or $NODEID+0x64")
+    bits = 8 * kind.size
+    signed = kind in (Kind.I8, Kind.I16, Kind.I32)
+    least, greatest = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
+    if entry.kind == _BOOLEAN:
+        greatest = 1
+
+    def held(number: int) -> int:
+        return number - (1 << bits) if signed and 1 << bits - 1 <= number < 1 << bits else number
+
+    value, of = held(value) if entry.hexadecimal else value, "its type"
+    limits = [None if one is None else held(one) for one in (entry.low, entry.high)]
+    # Files have limits that no value can fit; those of what is not written here do not matter.
+    low, high = (bound if one is None else one for one, bound in zip(limits, (least, greatest), strict=True))
+    if key >> 8 not in _OURS and least <= low < high <= greatest and (low, high) != (least, greatest):
+        least, greatest, of = low, high, "the file's LowLimit and HighLimit"
+    if not least <= value <= greatest:
+        raise ValueError(f"{where(Entry(key >> 8, key & 0xFF, kind, ''))} holds {least} to {greatest}, by {of}")
+    return value
 
 
 def _require_off(objects: Objects) -> None:
@@ -260,15 +338,29 @@ def _require_same(file: TextFile, objects: Objects) -> None:
             raise DriverError(f"node {objects.node}: {name} is {held:08X}h, but {file.name} is for {sheet[sub]:08X}h")
 
 
-def _set_back(objects: Objects, changes: Sequence[Change]) -> list[str]:
-    lost = []
-    for change in reversed(changes):
-        try:
-            if change.before is not None and not objects.dry:
-                objects.ensure(Write(change.entry, change.before))
-        except DriverError:
-            lost.append(f"node {objects.node} {where(change.entry)}")
-    return lost
+def _all_set_back(touched: Sequence[tuple[Objects, Sequence[Change]]]) -> str:
+    """Set drives back to what they held before these changes, the last one first; return the outcome in words."""
+    if not any(changes and not objects.dry for objects, changes in touched):
+        return "nothing was written"
+    lost = [
+        f"node {objects.node} {where(change.entry)}"
+        for objects, changes in reversed(touched)
+        for change in reversed(changes)
+        if not _is_set_back(objects, change)
+    ]
+    return f"NOT set back: {', '.join(lost)}" if lost else "every drive holds again what it held"
+
+
+def _is_set_back(objects: Objects, change: Change) -> bool:
+    if change.before is None:
+        return False
+    for _ in range(2):
+        with suppress(Exception, KeyboardInterrupt):  # whatever it is, the others have to be set back too
+            objects.ensure(Write(change.entry, change.before))
+            return True
+        with suppress(Exception, KeyboardInterrupt):
+            objects.discard_answers()  # that of a request which was interrupted, for one
+    return False
 
 
 def store_or_restore(
@@ -326,6 +418,7 @@ def imported_text(config: ArmConfig, found: Sequence[ImportedDrive], *, dry: boo
     for one in found:
         lines += ["", f"drive {one.drive}, node {one.node}, by {one.file}: {len(one.changes)} entries changed"]
         lines += [*_change_lines(one.changes)]
+        lines += [f"  {'left out':<16}{_listed(one.left_out)}"] if one.left_out else []
         lines.append(f"  {one.same} had their value already; {one.left} are set whenever the arm is opened")
     return "\n".join(lines) + "\n"
 

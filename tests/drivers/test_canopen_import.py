@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import re
+import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from helpers.emulated_arms import weightless_config
 from helpers.makers import SHEETS, Bench, arm_of, sheet
 
+from drivers.can.bus_state import BusError
+from drivers.can.can_frame import Frame
+from drivers.can.can_link import Link
 from drivers.canopen import object_dictionary as od
+from ident_service.cli import USAGE, VERDICT_NO, main
+from ident_service.config.arm import ArmConfig
+from ident_service.config.eds import DataSheetEntry
 from ident_service.config.quantities import TextFile
-from ident_service.errors import DriverError, UsageError
+from ident_service.errors import DriverError, FileCutOff, UsageError
 from ident_service.operations.drive_configuration import (
     drives_document,
     import_configuration,
@@ -25,9 +33,9 @@ EPOS4 = "maxon_epos4_50-8_0110h.eds"
 NOMINAL, GAIN, RATED = "3001sub1", "30A0sub1", "6076"
 
 
-def dcf(**values: int) -> TextFile:
+def dcf(text: str = "", **values: int | str) -> TextFile:
     """An EDS as its maker's tool would write it for one drive, with these values."""
-    text = sheet(EPOS4)["text"]
+    text = text or sheet(EPOS4)["text"]
     for name, value in values.items():
         text, count = re.subn(rf"(?im)^(\[{name}\]\r?\n)", rf"\g<1>ParameterValue={value}\n", text)
         assert count == 1, name
@@ -73,6 +81,75 @@ def test_a_refused_entry_sets_every_drive_back() -> None:
     assert (held(bench, 0x3001, 1), held(bench, 0x30A0, 1)) == before
 
 
+def broken_at_the_last(bench: Bench, error: BaseException, times: int) -> Callable[[ArmConfig], list[Link]]:
+    """Taps where waiting for the answer to the last drive's second value ends so; the answer still comes later."""
+
+    def links(config: ArmConfig) -> list[Link]:
+        (tap,) = taps = bench.links(config)
+        receive, left = tap.receive, [times]
+
+        def broken(deadline_ns: int) -> Frame | None:
+            last, now = struct.pack("<HB", 0x30A0, 1), tap.sent[-1] if tap.sent else None
+            reached = now is not None and (now.identifier, now.data[0] >> 5, now.data[1:4]) == (0x602, 1, last)
+            if left[0] and (reached or left[0] < times):
+                left[0] -= 1
+                raise error
+            return receive(deadline_ns)
+
+        tap.receive = broken  # type: ignore[method-assign]
+        return taps  # type: ignore[return-value]
+
+    return links
+
+
+@pytest.mark.parametrize("times", [1, 2])
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        (KeyboardInterrupt, ()),
+        (ValueError, ("a mistake",)),
+        (BusError, ("full", "can0")),
+        (DriverError, ("something",)),
+    ],
+)
+def test_whatever_ends_an_import_sets_every_drive_back_and_is_told(
+    kind: type[BaseException], words: tuple[str, ...], times: int
+) -> None:
+    error, interrupted = kind(*words), kind is KeyboardInterrupt
+    config = arm_of(EPOS4)
+    bench = Bench(config)
+    before = held(bench, 0x3001, 1), held(bench, 0x30A0, 1)
+    files = [dcf(**{NOMINAL: 4000, GAIN: 77})] * 2
+    with pytest.raises(DriverError if interrupted else kind) as told:
+        import_configuration(config, files, dry=False, open_bus=broken_at_the_last(bench, error, times))
+    assert len({place for place in bench.downloads() if place[0] == 1}) == 2  # the first drive had been written
+    assert (held(bench, 0x3001, 1), held(bench, 0x30A0, 1)) == before
+    said = "; ".join([str(told.value), *getattr(told.value, "__notes__", ())])
+    assert said.endswith("; every drive holds again what it held")
+    assert said.startswith("interrupted" if interrupted else str(error))
+
+
+def test_what_a_lost_bus_leaves_changed_is_named() -> None:
+    config = arm_of(EPOS4)
+    bench = Bench(config)
+    lost = broken_at_the_last(bench, BusError("gone", "can0"), 1000)
+    with pytest.raises(BusError) as told:
+        import_configuration(config, [dcf(**{NOMINAL: 4000, GAIN: 77})] * 2, dry=False, open_bus=lost)
+    changed = ", ".join(f"node {node} {entry}" for node in (2, 1) for entry in ("30A0h:01", "3001h:01"))
+    assert told.value.__notes__ == [f"NOT set back: {changed}"]
+    assert held(bench, 0x3001, 1) == [4000, 4000]
+
+
+def test_nothing_is_said_to_be_set_back_where_nothing_was_written() -> None:
+    config = arm_of(EPOS4)
+    bench = Bench(config)
+    del bench.behind.emulator.faces[1].objects.entries[0x30A001]  # type: ignore[attr-defined]
+    for dry, values in ((True, {NOMINAL: 4000, GAIN: 77}), (False, {GAIN: held(bench, 0x30A0, 1)[0]})):
+        with pytest.raises(DriverError, match=r"node 2: reading 30A0h.*; nothing was written$"):
+            import_configuration(config, [dcf(**values)] * 2, dry=dry, open_bus=bench.links)  # type: ignore[arg-type]
+        assert bench.downloads() == []
+
+
 def test_a_drive_that_is_on_or_another_is_not_touched() -> None:
     config = arm_of(EPOS4)
     bench = Bench(config)
@@ -105,6 +182,95 @@ def test_files_that_configure_nothing_are_refused() -> None:
         import_configuration(config, [TextFile(name="a.eds", text=sheet(EPOS4)["text"])] * 2, dry=True)
     with pytest.raises(UsageError, match="configures no drive"):
         import_configuration(config, [TextFile(name="a.eds", text="x")] * 2, dry=True)
+
+
+def no_bus(config: ArmConfig) -> list[Link]:
+    raise AssertionError("a file was refused only after a bus had been opened")
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("99999999999", "6065h holds 0 to 4294967295, by its type"),
+        ("0x100000000", "6065h holds 0 to 4294967295, by its type"),
+        ("-1", "6065h holds 0 to 4294967295, by its type"),
+        *(
+            (text, "is no whole number; write 100, 0x64")
+            for text in ("1e5", "abc", "12.5", "1F4h", "08", "1 2", "9" * 5000)
+        ),
+    ],
+)
+def test_a_value_that_an_entry_cannot_hold_is_refused_before_any_drive_is_asked(text: str, why: str) -> None:
+    config, files = arm_of(EPOS4), [dcf(**{NOMINAL: 4000}), dcf(**{GAIN: 77, "6065": text})]
+    for dry in (True, False):
+        with pytest.raises(UsageError) as told:
+            import_configuration(config, files, dry=dry, open_bus=no_bus)
+        assert f"drive.dcf: [6065] ParameterValue={text[:40]}: {why}" in str(told.value)
+        assert str(told.value).endswith("; nothing was written")
+
+
+def test_every_wrong_value_counts_and_limits_of_the_file_too() -> None:
+    config = arm_of(EPOS4)
+    texts = {"6098": "128", "60FF": "3000000000", NOMINAL: "4294967295", GAIN: "x", "6065": "y"}
+    with pytest.raises(UsageError, match=r"\[3001sub1\].*\[30A0sub1\].*\[6065\].*; and 2 more; nothing was written"):
+        import_configuration(config, [dcf(**texts)] * 2, dry=True, open_bus=no_bus)
+    for text in ("8001", "-1"):
+        with pytest.raises(
+            UsageError, match=rf"={text}: 3001h:01 holds 0 to 8000, by the file's LowLimit and HighLimit; nothing"
+        ):
+            import_configuration(config, [dcf(**{NOMINAL: text})] * 2, dry=True, open_bus=no_bus)
+
+
+def test_a_value_that_cannot_be_imported_is_named() -> None:
+    config = arm_of(EPOS4)
+    own = {"6041": "7", "6502": "x", "1018sub4": "9"}  # read-only; the last is compared by hosts, and never written
+    own |= {"21A0sub1": "1.5", "21A0sub2": "a drive", "21A0sub3": "0x500"}
+    text = sheet(EPOS4)["text"]
+    for number, kind, default in ((1, "0x8", "0"), (2, "0x9", ""), (3, "0x7", "$NODEID+0x400")):
+        text += f"\n[21A0sub{number}]\nDataType={kind}\nAccessType=rw\nDefaultValue={default}\n"
+    files = [dcf(text, **{NOMINAL: 4000}, **own)] * 2
+    bench = Bench(config)
+    for dry in (True, False):
+        found = import_configuration(config, files, dry=dry, open_bus=bench.links)  # type: ignore[arg-type]
+        assert list(found[1].left_out) == ["21A0h:01", "21A0h:02", "21A0h:03", "6041h", "6502h"]
+        text = imported_text(config, found, dry=dry)
+        assert "  left out        21A0h:01 (REAL32 is not imported); 21A0h:02 (VISIBLE_STRING is" in text
+        assert "21A0h:03 (of a node number, which is the drive's own); 6041h, 6502h (read-only)\n" in text
+        assert drives_document(config, found)["drives"][0]["left_out"]["6041h"] == "read-only"
+    with pytest.raises(UsageError, match=r"none of its values can be imported: 6041h \(read-only\)$"):
+        import_configuration(config, [dcf(**{"6041": 7})] * 2, dry=True, open_bus=no_bus)
+
+
+def test_numbers_are_read_as_the_standard_writes_them() -> None:
+    numbers = {"10": 10, "+5": 5, "-3": -3, "0": 0, "0xA": 10, "0XaB": 171, "017": 15, "-0x5": -5}
+    relative = {"$NODEID": 3, "$NODEID+0x200": 0x203, "0x200 + $NODEID": 0x203, "$nodeid+10": 13}
+    others = ("", "0x", "1e5", "08", "12.5", "180h", "$NODEID5", "5$NODEID", "$NODEID-1", "'5'", "１")
+    for text, number in (numbers | relative | dict.fromkeys(others)).items():
+        assert DataSheetEntry(7, text=text).standard_number(3) == number, text
+    config = arm_of(EPOS4)
+    bench = Bench(config)
+    values = {NOMINAL: "$NODEID+0x100", GAIN: "0115", "6083": "0x64", "6098": "0xFF", "60FF": "-5"}
+    found = import_configuration(config, [dcf(**values)] * 2, dry=False, open_bus=bench.links)  # type: ignore[arg-type]
+    assert [len(one.changes) for one in found] == [5, 5]
+    assert (held(bench, 0x3001, 1), held(bench, 0x30A0, 1)) == ([0x101, 0x102], [77, 77])
+    assert [held(bench, index) for index in (0x6083, 0x6098, 0x60FF)] == [[100] * 2, [-1] * 2, [-5] * 2]
+
+
+def test_a_file_that_is_cut_off_is_refused_as_by_a_probe(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config, whole = arm_of(EPOS4), dcf(**{NOMINAL: 4000})
+    half = TextFile(name="half.dcf", text=whole.text[: len(whole.text) * 7 // 10])
+    told = r"^half.dcf seems to end too early: of 127 announced objects \d+ are missing; .*nothing was written$"
+    for dry in (True, False):
+        with pytest.raises(FileCutOff, match=told):
+            import_configuration(config, [whole, half], dry=dry, open_bus=no_bus)
+    file = tmp_path / "half.dcf"
+    file.write_text(half.text, encoding="latin-1")
+    for words in (
+        ["probe", "wam7_canopen", "--eds", str(file)],
+        ["import", "wam7_canopen", *[str(file)] * 7, "--dry-run"],
+    ):
+        assert main(["bus", *words]) == VERDICT_NO
+        assert "seems to end too early: of 127 announced objects" in "".join(capsys.readouterr())
 
 
 def test_drives_store_and_restore_what_they_hold() -> None:
@@ -161,9 +327,11 @@ def test_a_zero_that_must_be_lost_with_power_is_not_stored_and_what_is_lacking_i
 
 
 def test_the_commands_ask_for_the_arms_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from ident_service.cli import USAGE, main
-
     file = tmp_path / "a.dcf"
+    file.write_text(dcf(**{NOMINAL: "1e5"}).text, encoding="latin-1")
+    for how in (["--dry-run"], ["--confirm", "wam7_canopen"]):
+        assert main(["bus", "import", "wam7_canopen", *[str(file)] * 7, *how]) == USAGE
+        assert "a.dcf: [3001sub1] ParameterValue=1e5: is no whole number" in capsys.readouterr().err
     file.write_text(dcf(**{NOMINAL: 4000}).text, encoding="latin-1")
     for words in (["import", "wam7_canopen", str(file)], ["store", "wam7_canopen"], ["restore", "wam7_canopen"]):
         for more in ([], ["--confirm", "other"]):

@@ -195,6 +195,12 @@ def test_the_command_judges_files_without_a_bus(tmp_path: Path, capsys: pytest.C
     assert "is no EDS" in document["drives"][1]["silent"]
     assert document["advice"] == ["none.eds: take the EDS or DCF of the drive's maker, undamaged"]
     assert document["highest_rate"] < 1000
+    for words in (
+        ["bus", "probe", "wam7_canopen", "--eds", str(tmp_path)],
+        ["emulate", "wam7_canopen", "--eds", str(tmp_path)],
+    ):
+        assert main(words) == USAGE
+        assert f"{tmp_path} is a folder; name a file in it" in capsys.readouterr().err
     assert main(["bus", "probe", "wam7_canopen", "--eds", "no.eds"]) == USAGE
 
 
