@@ -54,6 +54,8 @@ POWER_OFF = frozenset(
     {DriveState.NOT_READY, DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON, DriveState.FAULT}
 )
 
+FAULTS = frozenset({DriveState.FAULT, DriveState.FAULT_REACTION})
+
 # Values of 605Ah with which a drive stays in quick stop, and may be enabled out of it (transition 16).
 STAY_IN_QUICK_STOP = range(5, 9)
 
