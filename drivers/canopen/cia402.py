@@ -222,6 +222,11 @@ def joint_status(drives: Iterable[AxisStatus]) -> AxisStatus:
     return trouble | AxisStatus.POWERED if powered else trouble
 
 
+def is_communication_error(code: int) -> bool:
+    """Return whether an emergency is about communication with the host: CiA 301's groups 81h, 82h and 87h."""
+    return code >> 8 in (0x81, 0x82, 0x87)
+
+
 def emergency_words(code: int, register: int = 0, vendor: bytes = b"") -> str:
     """Describe an emergency: `8250h RPDO timeout: no torque frame came in time (error register: communication)`."""
     name = EMERGENCIES.get(code)
