@@ -21,7 +21,9 @@ from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.faults import ActiveFaults
 from ident_service.motion.run import run
 from ident_service.motion.state_machine import State
+from ident_service.motion.ticket import Verdict
 from ident_service.operations.recovery import recover
+from ident_service.preflight.preflight import preflight
 from sim_backend.canopen_device.drive import CanopenDrive
 from sim_backend.emulator.faults import DriveFault
 from sim_backend.emulator.lock_step import LockStepArm, hold_emulated_arm
@@ -85,7 +87,12 @@ def moved(config: ArmConfig, latch: ActiveFaults) -> State:
     return state
 
 
-def test_an_arm_is_moved_and_moved_again(config: ArmConfig, behind: LockStepArm) -> None:
+def test_an_arm_is_checked_moved_and_moved_again(config: ArmConfig, behind: LockStepArm) -> None:
+    model = arm_model(config)
+    motion = excitation(model, "identification")
+    told = preflight(make_arm(config), model, motion, confirm=lambda question: config.name, look_seconds=0.2)
+    assert told.verdict is Verdict.PASSED, [one.reason for one in told.checks if one.reason]
+    assert list(behind.emulator.states) == LEFT
     for _ in range(2):
         assert moved(config, ActiveFaults()) is State.DONE
         behind.settle(behind.clock.now_ns() + 2 * 10**9)
