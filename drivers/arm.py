@@ -288,8 +288,8 @@ class Arm(ABC):
         whoever has planned from where it stood looks again.
 
         Raises:
-            DriverError: a drive has latched a fault of its own or an emergency stop, which only `reset` clears, or
-                refuses for another reason; no axis stays energised.
+            DriverError: a drive has latched a fault of its own (`DriveFaulted`, where the driver tells) or an emergency
+                stop, which only `reset` clears, or refuses for another reason; no axis stays energised.
             EmergencyStopped: the emergency stop is pressed, or is while a person is waited for; likewise.
             NobodyEnabled: the person who enables the arm did not in time, or `still_wanted` said no; likewise.
         """

@@ -27,6 +27,7 @@
         ├── DriverError (OSError)      the arm cannot be opened, enabled or reached
         │   ├── ActionNeeded           a person has to act at the arm first, as the message says
         │   │   └── EmergencyStopped   the emergency stop is pressed, or has been
+        │   ├── DriveFaulted           a drive has latched a fault, which only a reset clears
         │   ├── AnotherDrive           a drive answers that the description does not name
         │   ├── UnsuitableDrive        a drive cannot be driven as the description says
         │   ├── NobodyEnabled          a person did not enable the arm in time, or is no longer waited for
@@ -258,6 +259,10 @@ class ActionNeeded(DriverError):
 
 class EmergencyStopped(ActionNeeded):
     """The emergency stop is pressed, or has been and must be cleared; the message says how."""
+
+
+class DriveFaulted(DriverError):
+    """A drive has latched a fault of its own and cannot be enabled before it is reset; the message says which."""
 
 
 class AnotherDrive(DriverError):

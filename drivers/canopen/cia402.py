@@ -54,6 +54,8 @@ POWER_OFF = frozenset(
     {DriveState.NOT_READY, DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON, DriveState.FAULT}
 )
 
+FAULTS = frozenset({DriveState.FAULT, DriveState.FAULT_REACTION})
+
 # Values of 605Ah with which a drive stays in quick stop, and may be enabled out of it (transition 16).
 STAY_IN_QUICK_STOP = range(5, 9)
 
@@ -218,6 +220,11 @@ def joint_status(drives: Iterable[AxisStatus]) -> AxisStatus:
         powered = powered and bool(word & AxisStatus.POWERED)
         trouble |= word & ~AxisStatus.POWERED
     return trouble | AxisStatus.POWERED if powered else trouble
+
+
+def is_communication_error(code: int) -> bool:
+    """Return whether an emergency is about communication with the host: CiA 301's groups 81h, 82h and 87h."""
+    return code >> 8 in (0x81, 0x82, 0x87)
 
 
 def emergency_words(code: int, register: int = 0, vendor: bytes = b"") -> str:

@@ -19,7 +19,16 @@ import numpy as np
 from drivers.arm import Watchdog
 from drivers.canopen import object_dictionary as od
 from drivers.canopen.capabilities import DRIVE_PROFILE, TORQUE_UNITS, Capabilities, parse_entry, where
-from drivers.canopen.cia402 import COMMUNICATION_ERROR, ERROR_PASSIVE, POWER_OFF, DriveState, state_of
+from drivers.canopen.cia402 import (
+    COMMUNICATION_ERROR,
+    DISABLE_VOLTAGE,
+    ERROR_PASSIVE,
+    FAULTS,
+    POWER_OFF,
+    RESET_FAULT,
+    DriveState,
+    state_of,
+)
 from drivers.canopen.motor_units import count_limits, torque_limit_counts
 from drivers.canopen.object_dictionary import Entry, Kind, OperationMode
 from drivers.canopen.pdo_mapping import BusProfile, Pdo, Write
@@ -189,6 +198,7 @@ _COUNTS_PER_LINE = (1.0, 4.0)
 _GENTLER = 0.5  # of the wanted deceleration, that a drive's own may be: the ramp takes twice as long
 _MODE_PATIENCE, _MODE_AGAIN_NS = 0.5, 10_000_000  # s for drives that show it while off, ns between two reads
 _ROUNDING = 1e-6
+_RESET_PATIENCE, _RESET_STEP_NS = 0.2, 3_000_000  # s, ns
 _TARGETS = (od.TARGET_TORQUE, od.TARGET_TORQUE_WIDE, od.TARGET_POSITION)
 _LETS_GO, _STAYS = 2, 6  # values of 605Ah: a ramp, then power off, or hold on
 IDENTITY = {"vendor": od.VENDOR, "product": od.PRODUCT, "revision": od.REVISION, "serial": od.SERIAL}
@@ -474,9 +484,21 @@ def _mode_entry(text: str) -> Entry:
     return parse_entry(text, "mode of operation of the maker's")
 
 
-def disable_supervision(
-    objects: Objects, zeros: Zeros | None, number: int, restarted: Callable[[], bool]
-) -> DriveState:
+@dataclass(frozen=True)
+class LeftDrive:
+    """Represent a drive that its host is about to leave.
+
+    Attributes:
+        state: state in which it is.
+        reacts: whether it is off, and may answer with a fault that it is left: its reaction to a lost host (6007h) is
+            missing or cannot be set to nothing.
+    """
+
+    state: DriveState
+    reacts: bool = False
+
+
+def disable_supervision(objects: Objects, zeros: Zeros | None, number: int, restarted: Callable[[], bool]) -> LeftDrive:
     """Disable the supervision of the host in a drive that is off; a drive that is on keeps it.
 
     A zero that the drive has confirmed it confirms afterwards too, and nothing else: one that restarted in the session
@@ -488,28 +510,54 @@ def disable_supervision(
         number: of the drive.
         restarted: whether it has sent a boot-up message in the session.
 
-    Returns:
-        The state in which the drive is.
-
     Raises:
         DriverError: it does not answer.
-        SdoRefused: it refuses a part; all others are done.
+        SdoRefused: it refuses a part, other than as an entry that can only be read for 6007h; all others are done.
     """
     # Asked for: a status report may be held back by its inhibit time.
     state = state_of(objects.read(od.STATUS_WORD))
     if state not in POWER_OFF:
-        return state
+        return LeftDrive(state)
     counts = zeros.held(objects, number) if zeros is not None else None
     kept: SdoRefused | None = None
+    reacts = False
     for entry in (od.ABORT_CONNECTION, od.HEARTBEAT_CONSUMER, od.GUARD_TIME):  # or 8130h would follow every session
         try:
-            optional(objects.write, Write(entry, 0))
+            objects.write(Write(entry, 0))
         except SdoRefused as refused:
-            kept = kept or refused
+            missing = refused.code in DOES_NOT_EXIST
+            fixed = entry is od.ABORT_CONNECTION and (missing or refused.code in READ_ONLY)
+            reacts = reacts or (fixed and state not in FAULTS)
+            if not missing and not fixed:
+                kept = kept or refused
     if zeros is not None and counts is not None:
         zeros.restore_mark(objects, number, counts, restarted)
     if kept is not None:
         raise kept
+    return LeftDrive(state, reacts)
+
+
+def reset_farewell_fault(objects: Objects, blames: Callable[[], bool]) -> DriveState:
+    """Reset the fault with which a pre-operational drive has answered that its host left it, if it did.
+
+    No next session could enable the drive, and closing the one that resets it would leave the fault behind again.
+
+    Args:
+        objects: of a drive that was off, without a fault, before it was left.
+        blames: whether the drive gives another reason for a fault, which then stays.
+
+    Returns:
+        The state in which the drive is at last.
+
+    Raises:
+        DriverError: it does not answer, or refuses control words.
+    """
+    clock = objects.clock
+    last_ns = clock.now_ns() + round(_RESET_PATIENCE * 1e9)
+    while (state := state_of(objects.read(od.STATUS_WORD))) in FAULTS and not blames() and clock.now_ns() < last_ns:
+        for word in (DISABLE_VOLTAGE, RESET_FAULT):  # a rising edge; some drives look once in a millisecond
+            objects.write(Write(od.CONTROL_WORD, word))
+            clock.sleep_until_ns(clock.now_ns() + _RESET_STEP_NS)
     return state
 
 

@@ -45,10 +45,12 @@ from drivers.canopen.capabilities import required
 from drivers.canopen.cia402 import (
     DISABLE_VOLTAGE,
     ENABLE,
+    FAULTS,
     POWER_OFF,
     QUICK_STOP,
     DriveState,
     NmtCommand,
+    is_communication_error,
     joint_status,
     state_of,
 )
@@ -60,6 +62,7 @@ from drivers.canopen.drive_setup import (
     is_error_passive,
     motor_limits,
     quick_stop_option,
+    reset_farewell_fault,
     watchdogs_of,
 )
 from drivers.canopen.motor_units import coordinates, signed
@@ -77,6 +80,7 @@ from ident_service.errors import DriverError, PositionUnknown
 
 _TRIES, _AGAIN = 75, 0.001  # s between them
 _BRAKING = 1.0  # s that drives may take for a quick stop, or a link for a stop, before the arm is left to its drives
+_NOTICED = 0.02  # s within which a drive answers with a fault that it was left
 _FAREWELL = 5  # cycles after the last control words, in which drives report that they are off
 _ENDING = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP, DriveState.FAULT_REACTION)
 
@@ -577,12 +581,16 @@ class CanopenArm(Arm):
         # Silent drives are asked for nothing any more: an answer would be taken for one to the requests below.
         buses.enabled = False
         there: dict[int, Objects] = {}  # by bus
+        reacting: dict[int, Emergency | None] = {}  # drives that may answer with a fault, and their last emergency
         for number, drive in enumerate(self._driver.drives[: self._begun]):
             with suppress(Exception):
                 buses.cycle(zero)  # what was asked before is answered in it
             objects, said = buses.objects_in_cycles(number, zero), ""
             try:
-                state = disable_supervision(objects, self._zeros, number, buses.restarted(number))
+                left = disable_supervision(objects, self._zeros, number, buses.restarted(number))
+                state = left.state
+                if left.reacts:
+                    reacting[number] = buses.drives[number].emergency
                 said = "" if state in (*POWER_OFF, DriveState.QUICK_STOP) else f"is in the state {state}"
                 there[drive.bus] = buses.objects(number)
             except Exception as error:  # noqa: BLE001 - whatever a drive or its bus died of, the others must be left
@@ -595,9 +603,29 @@ class CanopenArm(Arm):
         for number in range(len(buses.drives)):
             with suppress(Exception):
                 buses.command_drive(number, NmtCommand.ENTER_PRE_OPERATIONAL)
+        if reacting:
+            self._reset_farewell_faults(buses, reacting)
         for objects in there.values():
             with suppress(Exception):  # the answer comes after all commands, which closing a link could cut off
                 objects.read(od.DEVICE_TYPE)
+
+    def _reset_farewell_faults(self, buses: Buses, before: Mapping[int, Emergency | None]) -> None:
+        """Reset drives to which it is a fault that they were left; `before` has their emergencies before that."""
+        with suppress(Exception):
+            buses.clock.sleep_until_ns(buses.clock.now_ns() + round(_NOTICED * 1e9))
+        for number, known in before.items():
+
+            def blames(drive: Drive = buses.drives[number], known: Emergency | None = known) -> bool:
+                told = drive.emergency
+                return told is not None and told is not known and not is_communication_error(told.code)
+
+            try:
+                state = reset_farewell_fault(buses.objects(number), blames)
+                said = "" if state in POWER_OFF - FAULTS else f"is in the state {state} since it was left"
+            except Exception as error:  # noqa: BLE001 - as in `_leave`
+                said = str(error) or repr(error)
+            if said:
+                self._unconfirmed.append(f"{self._names[number]}: {said}")
 
     def _open(self) -> Buses:
         if self._buses is None:

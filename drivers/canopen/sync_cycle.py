@@ -27,6 +27,7 @@ from drivers.canopen import object_dictionary as od
 from drivers.canopen.cia402 import (
     DISABLE_VOLTAGE,
     ENABLE,
+    FAULTS,
     RESET_FAULT,
     STAY_IN_QUICK_STOP,
     TOWARDS_ENABLED,
@@ -40,7 +41,7 @@ from drivers.canopen.pdo_codec import BusCodec, Drive
 from drivers.canopen.pdo_mapping import GUARD_EARLY, HEARTBEAT, SDO_REPLY, SDO_REQUEST, BusProfile
 from drivers.canopen.sdo import TIMEOUT, Objects, upload_request
 from drivers.clock import Clock
-from ident_service.errors import DriverError
+from ident_service.errors import DriveFaulted, DriverError
 
 RECEIVE = 0.97  # of a period, within which a position counts for its cycle (FIELDBUS.md: the last is on the wire then)
 HUSH = 0.02  # s in which the last frames of an earlier session may still be on their way
@@ -431,7 +432,6 @@ MODE_PATIENCE = 5.0  # s that a mode of operation may take once drives are switc
 SEEDED = 5  # cycles in a row with zero torque and all positions before anything is enabled
 REPEAT = 0.05  # s after which a command that had no effect is sent again
 _WAY = (DriveState.READY_TO_SWITCH_ON, DriveState.SWITCHED_ON, DriveState.OPERATION_ENABLED)
-_FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION)
 
 
 class EnableSequence:
@@ -481,10 +481,11 @@ class EnableSequence:
         """Return the control words to send in this cycle, with the numbers of their drives.
 
         Raises:
-            DriverError: a drive has a fault, or the step's time is over; who, and why as far as it is known.
+            DriveFaulted: a drive has a fault; which, and why as far as it is known.
+            DriverError: the step's time is over; likewise.
         """
-        if bad := [drive for drive in self._drives if drive.state in _FAULTS]:
-            raise DriverError(
+        if bad := [drive for drive in self._drives if drive.state in FAULTS]:
+            raise DriveFaulted(
                 f"{_states_text(self._drives, self._names, bad)}; only a reset clears it (`ident recover`)"
             )
         for number, drive in enumerate(self._drives):
@@ -554,14 +555,14 @@ class Resetting:
     @property
     def done(self) -> bool:
         """Return whether no drive is in a fault any more, nor in an unknown state."""
-        return all(drive.state not in (*_FAULTS, DriveState.UNKNOWN) for drive in self._drives)
+        return all(drive.state not in (*FAULTS, DriveState.UNKNOWN) for drive in self._drives)
 
     def commands(self, now_ns: int) -> list[tuple[int, int]]:
         """Return the control words to send in this cycle; DriverError when the time is over and a fault persists."""
         if self.done:
             return []
         if now_ns > self._deadline_ns:
-            kept = [drive for drive in self._drives if drive.state in (*_FAULTS, DriveState.UNKNOWN)]
+            kept = [drive for drive in self._drives if drive.state in (*FAULTS, DriveState.UNKNOWN)]
             raise DriverError(f"the cause is still there: {_states_text(self._drives, self._names, kept)}")
         words = []
         for number, drive in enumerate(self._drives):

@@ -22,7 +22,14 @@ import numpy as np
 
 from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector
 from ident_service.config.motion_limits import MotionLimits, motion_limits
-from ident_service.errors import ArmFault, DriverError, EmergencyStopped, MotionRefused, NobodyEnabled
+from ident_service.errors import (
+    ArmFault,
+    DriveFaulted,
+    DriverError,
+    EmergencyStopped,
+    MotionRefused,
+    NobodyEnabled,
+)
 from ident_service.excitation.motion_file import Excitation
 from ident_service.model.arm_model import ArmModel, control_model
 from ident_service.model.collision import Contact, lowest_point
@@ -193,7 +200,7 @@ def run(
         UsageError: the speed is not above 0 and at most 1; nothing has moved.
         MotionRefused: nothing has moved; the message says why.
         ArmFault: a fault stopped the motion; the arm is without torque, and the fault latched.
-        DriverError: the arm refused to be enabled.
+        DriverError: the arm refused to be enabled, not because a drive has a fault.
     """
     return follow(arm, model, ExcitationPlan(excitation, speed), sink, controls, latch=latch, hold_seconds=hold_seconds)
 
@@ -308,6 +315,8 @@ class _Run:
                 return False
             except EmergencyStopped as error:
                 raise ArmFault("emergency_stop", str(error)) from error
+            except DriveFaulted as error:
+                raise ArmFault("drive_fault", str(error)) from error
             finally:
                 # The arm outlives this run; a motion process, which collects no garbage, would keep all of it at exit.
                 self.arm.still_wanted = wanted

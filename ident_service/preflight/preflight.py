@@ -361,10 +361,20 @@ class _Preflight:
             half = DWELL + 0.5 * stroke.there.duration
             session.follow(stroke, half)
             moving = watchdog_check(self.arm, self.model, session, lambda time: stroke.at(half + time), stroke.joint)
+            if moving.verdict is Verdict.PASSED:
+                self._end_own_fault()
         except (MotionRefused, ArmFault) as error:
             self.arm.stop(StopKind.TORQUE_OFF)
             return failed(CODE, f"in motion: {error}", REST_REMEDY, at_rest.measures)
         return replace(moving, measures=(*at_rest.measures, *moving.measures))
+
+    def _end_own_fault(self) -> None:
+        """Reset drives to which the host's silence was a fault: a run would find them in it."""
+        words = self.arm.drive_status() or self.arm.exchange(None).status
+        if any(AxisStatus(word) & AxisStatus.FAULT for word in words):
+            self.arm.close()  # drives that miss their host may hear no frames but those of another session
+            self.arm.open()
+            self.arm.reset()
 
     def _judged(
         self,

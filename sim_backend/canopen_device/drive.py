@@ -20,11 +20,12 @@ motor coasts, unless the description says that the drive leaves the windings sho
 A host configures it by SDO alone; all it does follows from its object dictionary. At a SYNC the position is sampled
 and told, then the torque that came before the SYNC begins to act.
 
-What makes it stop by itself, each by the option in 6007h (0 nothing, 1 fault, 2 disable voltage, 3 quick stop;
-CiA 402-2, 10.3.2): a heartbeat or a question of node guarding that stays away (1016h, 100Ch and 100Dh, after which the
-node also leaves `operational`, 1029h:01), an RPDO that stays away for longer than its event timer, SYNC that stays away
-for 2F70h of its periods (1006h), a target torque that does for 2F75h [ms], and NMT commands that end `operational`. The
-two entries of the maker's stand for those of real ones.
+What makes it stop by itself, each by the option in 6007h (0 nothing, 1 fault, of a drive that is off too, 2 disable
+voltage, 3 quick stop; CiA 402-2, 10.3.2; without 6007h the maker's choice, here 1): a heartbeat or a question of node
+guarding that stays away (1016h, 100Ch and 100Dh, after which the node also leaves `operational`, 1029h:01), an RPDO
+that stays away for longer than its event timer, SYNC that stays away for 2F70h of its periods (1006h), a target torque
+that does for 2F75h [ms], and NMT commands that end `operational`. The two entries of the maker's stand for those of
+real ones.
 """
 
 from __future__ import annotations

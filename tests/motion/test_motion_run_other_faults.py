@@ -13,7 +13,7 @@ from run_bench import HOME, LIMITS, MIDWAY, PERIOD, Bench
 
 from drivers.arm import Sample, StopKind
 from drivers.axis_status import AxisEvent, AxisEventCode
-from ident_service.errors import DriverError, MotionRefused
+from ident_service.errors import DriveFaulted, DriverError, MotionRefused
 from ident_service.motion.controller import ComputedTorque
 from ident_service.motion.safety_monitor import TORQUE_RATE, TORQUE_RATE_SHARE
 from ident_service.motion.state_machine import State
@@ -132,6 +132,17 @@ def test_an_arm_that_cannot_be_enabled_is_left_without_torque(make: Callable[...
     assert bench.arm.stops == [StopKind.QUICK_STOP]
     assert bench.arm.torques == []
     assert bench.story.states == ["checked", "faulted"]
+
+
+def test_a_drive_that_is_in_a_fault_when_it_is_enabled_stops_the_run_by_the_fault_of_that_name(
+    make: Callable[..., Bench],
+) -> None:
+    bench = make()
+    bench.arm.enable_error = DriveFaulted("drive 3 is in the state fault")
+    error = bench.fault()
+    assert (error.code, str(error)) == ("drive_fault", "drive_fault: drive 3 is in the state fault")
+    assert bench.arm.stops == [StopKind.QUICK_STOP]
+    assert bench.arm.torques == []
 
 
 class _Broken(Exception):
