@@ -73,7 +73,7 @@ def test_lists_are_read_to_their_end(client: IdentClient, state: Path) -> None:
 
 
 def test_errors_are_of_one_tree(
-    client: IdentClient, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    client: IdentClient, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     with pytest.raises(UnknownId, match="nothing"):
         client.job("nothing")
