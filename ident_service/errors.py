@@ -29,6 +29,7 @@
         │   │   └── EmergencyStopped   the emergency stop is pressed, or has been
         │   ├── DriveFaulted           a drive has latched a fault, which only a reset clears
         │   ├── AnotherDrive           a drive answers that the description does not name
+        │   ├── UnsuitableDrive        a drive cannot be driven as the description says
         │   ├── NobodyEnabled          a person did not enable the arm in time, or is no longer waited for
         │   └── PositionUnknown        the encoders lost their zero: a person must set the home
         ├── Stopped                    a motion did not come to its end, because a stop was requested
@@ -266,6 +267,10 @@ class DriveFaulted(DriverError):
 
 class AnotherDrive(DriverError):
     """A drive has another identity than the description says."""
+
+
+class UnsuitableDrive(DriverError):
+    """A drive cannot be driven as the description says; the message says what to change, or what it lacks."""
 
 
 class NobodyEnabled(DriverError):

@@ -27,7 +27,7 @@ from ident_service.config.drive_family import (
     family_from,
 )
 from ident_service.config.eds import DataSheet
-from ident_service.errors import DriverError
+from ident_service.errors import DriverError, UnsuitableDrive
 
 _FOLDER = Path(__file__).parent / "profiles"
 GENERIC = "generic402"
@@ -207,10 +207,10 @@ class Capabilities:
         )
 
     def require(self, node: int) -> None:
-        """Raise DriverError where the drive is to be refused, with everything that is wrong."""
+        """Raise UnsuitableDrive where the drive is to be refused, with everything that is wrong."""
         if wrong := (*self.problems, *self.changes):
             told = "; ".join(map(str, wrong))
-            raise DriverError(f"node {node}: cannot be driven ({self.family.name}): {told}")
+            raise UnsuitableDrive(f"node {node}: cannot be driven ({self.family.name}): {told}")
 
 
 def capabilities(objects: Objects, driver: CanopenDriver, number: int) -> Capabilities:

@@ -211,7 +211,7 @@ def _text(found: Recovery) -> str:
     if not found.faults:
         lines.append("  no active faults")
     if found.moved_by is not None:
-        lines.append(f"  process {found.moved_by} is moving the arm")
+        lines.append(f"  process {found.moved_by} moves the arm, or holds it after a stop")
     if found.unreachable:
         lines.append(f"  the arm does not answer: {found.unreachable}")
     if found.zero_lost:

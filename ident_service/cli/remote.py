@@ -139,11 +139,14 @@ def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
                 if "valid token" not in str(error):
                     raise
                 # The daemon's words are for programs that speak HTTP.
-                given = "$IDENT_TOKEN" if os.environ.get("IDENT_TOKEN") else str(state_folder(arguments) / "token")
+                place = state_folder(arguments) / "token"
+                given = "$IDENT_TOKEN" if os.environ.get("IDENT_TOKEN") else str(place) if place.is_file() else None
+                why = f"there is none in $IDENT_TOKEN or {place}, and this daemon asks for one"
+                if given is not None:
+                    why = f"the token from {given} does not count there: it was revoked, or is of another daemon"
                 raise AccessRefused(
-                    f"{client.url}: the token from {given} does not count there: it was revoked, or is of another"
-                    " daemon; `ident tokens add NAME --role operator` makes one at the daemon's machine, and"
-                    " IDENT_TOKEN=... gives it to this command"
+                    f"{client.url}: {why}; `ident tokens add NAME --role operator` makes one at the daemon's machine, "
+                    "and IDENT_TOKEN=... gives it to this command"
                 ) from None
 
     return connected

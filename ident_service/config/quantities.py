@@ -154,7 +154,7 @@ def _read(value: Any, info: ValidationInfo, decode: Callable[[bytes], str]) -> A
         there, is_folder = path.is_file(), path.is_dir()
     except OSError:  # for example, the name is too long
         there = is_folder = False
-    if is_folder:
+    if is_folder and (info.context is None or info.context.get(UPLOAD) != folder):
         raise ValueError(f"{path} is a folder; name a file in it")
     if not there:
         raise ValueError(f"no such file: {path}; give its path as seen from the description's folder")

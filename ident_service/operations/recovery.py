@@ -35,7 +35,8 @@ from ident_service.registry.state_folder import control_path, fault_file, ticket
 
 LOOK = 0.3  # s
 AT_HOME = 0.05  # rad or m
-_SUPPORT = "Support the arm, or make sure that it rests on something: nothing holds it now."
+_SUPPORT = "Support the arm, or make sure that it rests on something: {} it now."
+_BRAKED = "Support the arm, or see that its brakes hold it."
 _HELD = "Support the arm, then `ident supported {}`: its drives hold it in quick stop, and release it then."
 _SEEN = 20  # cycles until the drives' status has arrived
 
@@ -113,10 +114,11 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str 
         unreachable = str(error)
     tripped = {} if seen is None else _tripped(seen)
     out = [] if seen is None else position_limit_violations(seen.position, limits, seen.joint_names)
-    support = _SUPPORT
+    support, holds = _support(config), False
     if seen is not None and config.idle_drives_hold and any(w & AxisStatus.IDLE for w in seen.status):
-        support = _HELD.format(called)
-    before = _before(called, faults, seen, unreachable, zero_lost, tripped, refusal, limits, support)
+        support, holds = _HELD.format(called), True
+    before = _before(called, faults, seen, unreachable, zero_lost, tripped, refusal, limits)
+    before = [support, *before] if before or holds else before
     usable = not before
     steps = (*before, _last_step(called, seen, limits, bool(out)))
     return Recovery(config.name, faults, None, seen, unreachable, zero_lost, reset, tripped, tuple(out), steps, usable)
@@ -179,9 +181,8 @@ def _before(
     tripped: dict[str, str],
     refusal: DriverError | None,
     limits: MotionLimits,
-    support: str,
 ) -> list[str]:
-    """Return what must be done before the arm is usable, in order."""
+    """Return what must be done before the arm is usable, in order, but for supporting it."""
     steps = [f"`ident acknowledge {name} {one.code}`, when you know the cause: {one.cause}." for one in faults]
     zero_lost = zero_lost.replace(" ARM`", f" {name}`")
     if unreachable:
@@ -189,7 +190,7 @@ def _before(
     if zero_lost:
         steps.append(f"Set its home: {zero_lost}.")
     if seen is None:
-        return [support, *steps, f"`ident recover {name}` again."]
+        return [*steps, f"`ident recover {name}` again."]
     silent = [joint for joint, q in zip(seen.joint_names, seen.position, strict=True) if not np.isfinite(q)]
     if silent:
         steps.append(f"Check power and cables of the axes that do not answer: {', '.join(silent)}.")
@@ -208,7 +209,15 @@ def _before(
             )
         except MotionRefused as error:
             steps.append(f"Bring it back by hand: {error}.")
-    return [support, *steps] if steps or support is not _SUPPORT else steps
+    return steps
+
+
+def _support(config: ArmConfig) -> str:
+    """Return what keeps an arm without power from sinking, and what a person must do about it."""
+    braked = [name for name, joint in config.joints.items() if joint.brake]
+    if len(braked) == len(config.joints):
+        return _BRAKED
+    return _SUPPORT.format(f"only the brakes of {', '.join(braked)} hold" if braked else "nothing holds")
 
 
 def _to_mend(tripped: dict[str, str], refusal: DriverError) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 from drivers.arm import Arm, ArmDescription, Sample, SetupCheck, Vector
 from drivers.axis_status import AxisStatus
 from ident_service.config.motion_limits import MotionLimits
-from ident_service.errors import AnotherDrive, ArmError, PositionUnknown
+from ident_service.errors import AnotherDrive, ArmError, PositionUnknown, UnsuitableDrive
 from ident_service.model.arm_model import ArmModel
 from ident_service.motion.last_position import LOOK_AT_IT, LastPosition, turned
 from ident_service.motion.ticket import (
@@ -308,4 +308,6 @@ def unreachable(error: ArmError) -> Check:
         remedy = (
             "Put the drives back in place; after a repair calibrate zero and torque scale, then enter the new identity."
         )
+    elif isinstance(error, UnsuitableDrive):
+        remedy = "Change the description as it says, or take another drive; `ident bus probe ARM` asks for all at once."
     return Check("identities", Verdict.FAILED, (), str(error), remedy)

@@ -13,7 +13,7 @@ from test_driver_watchdogs import Bench as HeldBench
 from drivers.arm import StopKind
 from drivers.axis_status import AxisStatus
 from ident_service.config.arm import ArmConfig
-from ident_service.errors import DriverError
+from ident_service.errors import DriverError, UnsuitableDrive
 from ident_service.motion.ticket import Verdict
 from ident_service.operations.fieldbus import bus_probe, probe_text
 
@@ -90,7 +90,7 @@ def test_a_second_bring_up_writes_what_closing_took_back_and_nothing_else(name: 
 @pytest.mark.parametrize("name", REFUSED)
 def test_a_drive_without_a_torque_mode_is_refused_before_anything_is_written(name: str) -> None:
     bench = Bench(arm_of(name, measured_torque="none"))
-    with pytest.raises(DriverError, match=rf"node 1: cannot be driven .*{REFUSED[name]}"):
+    with pytest.raises(UnsuitableDrive, match=rf"node 1: cannot be driven .*{REFUSED[name]}"):
         bench.arm.open()
     assert bench.downloads() == []
 

@@ -73,7 +73,7 @@ def test_lists_are_read_to_their_end(client: IdentClient, state: Path) -> None:
 
 
 def test_errors_are_of_one_tree(
-    client: IdentClient, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    client: IdentClient, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     with pytest.raises(UnknownId, match="nothing"):
         client.job("nothing")
@@ -98,6 +98,10 @@ def test_errors_are_of_one_tree(
     )
     assert "`ident tokens add NAME --role operator`" in said
     assert "Bearer" not in said
+    with monkeypatch.context() as patched:
+        patched.delenv("IDENT_TOKEN", raising=False)
+        assert main(["jobs", "list", "--server", client.url, "--state", str(tmp_path / "fresh")]) == 2
+    assert "there is none in $IDENT_TOKEN or " in capsys.readouterr().err
     for token in (None, "ident_no"):  # in words that are no HTTP, either
         with (
             IdentClient(client.url, token) as nobody,

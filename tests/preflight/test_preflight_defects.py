@@ -17,7 +17,7 @@ from drivers.clock import VirtualClock
 from ident_service.config.arm import ArmConfig
 from ident_service.config.can_bus import CanBus
 from ident_service.config.load import load_arm
-from ident_service.errors import ArmFault, DriverError
+from ident_service.errors import ArmFault, DriverError, UnsuitableDrive
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.faults import FAULTS
@@ -93,6 +93,16 @@ def test_an_arm_that_cannot_be_opened_is_a_failed_check_and_no_exception() -> No
     ticket = flight.ticket()
     assert "pid 7" in only_failure(ticket, "identities").reason
     assert ticket.subject.identities == ()
+
+
+def test_no_cable_is_to_be_checked_for_a_drive_that_the_description_does_not_fit() -> None:
+    flight = Flight()
+
+    def refuse() -> None:
+        raise UnsuitableDrive("node 1: cannot be driven (maxon EPOS2): drives.rated_torque: 0.2 N m")
+
+    flight.arm.open = refuse  # type: ignore[method-assign]
+    assert only_failure(flight.ticket(), "identities").remedy.startswith("Change the description as it says")
 
 
 def test_another_arm_on_the_bus_is_not_touched() -> None:

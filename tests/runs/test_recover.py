@@ -19,7 +19,7 @@ from ident_service.config.load import load_arm, shipped_arms
 from ident_service.errors import ActionNeeded, DriverError
 from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.command_channel import ControlFile
-from ident_service.operations.recovery import Recovery, recover
+from ident_service.operations.recovery import Recovery, _support, recover
 from ident_service.registry.state_folder import control_path, fault_file
 from sim_backend.arm import from_config
 from sim_backend.faults import Fault, FaultKind
@@ -272,3 +272,19 @@ def test_a_motions_ticket_is_one_for_the_path_home(ident: Callable[..., tuple[in
 
 def test_a_check_is_for_a_motion_or_for_home(ident: Callable[..., tuple[int, str]]) -> None:
     assert ident("check", "motion.json", "--home")[0] == 2
+
+
+@pytest.mark.parametrize(
+    ("braked", "words"),
+    [
+        (("shoulder", "elbow"), "Support the arm, or see that its brakes hold it."),
+        (("elbow",), "only the brakes of elbow hold it now"),
+        ((), "nothing holds it now"),
+    ],
+)
+def test_what_holds_an_arm_without_power_is_told(braked: tuple[str, ...], words: str) -> None:
+    document = load_arm("planar2").model_dump(mode="json", by_alias=True)
+    document["control"]["after_stop"] = "hold"
+    for name, joint in document["joints"].items():
+        joint["brake"] = name in braked
+    assert words in _support(ArmConfig.model_validate(document))
