@@ -316,7 +316,9 @@ def direction_check(
         found,
         "Check this joint's gear ratio, encoder steps per turn and torque constant in the driver's configuration, and "
         "that no brake and nothing else holds it; a joint that responds too little may lack drive inertia in the prior."
-        " A hidden delay is in the drive's filters or its interpolation, or belongs into identification.delay.",
+        " One that only falls short of its displacement, and answers torque as expected, is held back by its dry "
+        "friction: a larger kp brings it closer. A hidden delay is in the drive's filters or its interpolation, or "
+        "belongs into identification.delay.",
     )
     if odd and check.verdict is Verdict.PASSED:
         return replace(check, reason=_of_odd_answers(odd, model))
