@@ -505,7 +505,7 @@ class SimulatedHardware:
         return self._near and sunk > stand.sinking
 
     def truth(self, stamp_ns: int) -> Truth:
-        """Return the truth at the beginning of the present period, which is at `stamp_ns`."""
+        """Return the present motion, stamped `stamp_ns`; its acceleration is the mean over the period before."""
         plant = self.plant
         return Truth(stamp_ns, plant.position, plant.velocity, plant.acceleration, self._drives.torque)
 

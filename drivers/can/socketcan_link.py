@@ -241,7 +241,7 @@ class RawLink:
             raise self._failure(error) from None
 
     def receive(self, deadline_ns: int) -> Frame | None:
-        """Return the next frame, None when there is none until the deadline [ns of the clock].
+        """Return the next frame; None where none has come by the deadline [ns of the link's clock].
 
         Raises:
             BusError: interface down or gone.

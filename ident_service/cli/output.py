@@ -60,7 +60,7 @@ def print_error(kind: str, message: str, code: int, more: Mapping[str, object] |
 
 
 def print_to_person(text: str) -> None:
-    """Print on stderr; one that is closed, or on a full disk, is ignored."""
+    """Write text, which has its own line breaks, to stderr; a stderr that cannot be written to is ignored."""
     with suppress(OSError):
         write(sys.stderr, text)
 

@@ -204,7 +204,7 @@ def _validated(kind: type[_Described], tree: Tree, path: Path, context: dict[str
 
 
 def nested(schema: Mapping[str, Any], document: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
-    """Yield a part of a schema and all alternatives in it, references followed.
+    """Yield a part of a schema, what it refers to, and every member of its anyOf and allOf, again and again.
 
     Args:
         schema: the part.

@@ -106,11 +106,11 @@ class Column(Section):
         # A plain name, so that descriptions without units keep the hash they had before units existed.
         return self.column if self.unit is None and self.factor == 1.0 else serialized(self)
 
-    def scale(self, name: str) -> float:
-        """Return the factor that converts a number of this column to SI.
+    def si_factor(self, name: str) -> float:
+        """Return the factor to SI for a number of this column, whose quantity `name` says; check that its unit fits.
 
         Args:
-            name: column name of this package, such as `tau3`, which says the quantity.
+            name: name of the column in `ident`'s own files, such as `tau3`, which says the quantity.
 
         Raises:
             ValueError: an unknown unit, one of another quantity, one that needs a factor, or a factor that repeats
@@ -294,7 +294,7 @@ class RecordingFormat(Section):
         wrong = []
         for name, one in columns.items():
             try:
-                one.scale(name)
+                one.si_factor(name)
             except ValueError as error:
                 wrong.append(f"{name}: {error}")
         if wrong:

@@ -186,7 +186,7 @@ class Prover:
         why = "; ".join(violations(proof, self._model, limits))
         return proof, why or self._veto(path) or ""
 
-    def best_of(
+    def prove_best(
         self,
         candidates: Sequence[Candidate],
         per_period: int,
@@ -195,16 +195,20 @@ class Prover:
         best: Attempt | None = None,
         task: Task | None = None,
     ) -> Attempt | None:
-        """Return the best motion that can be proven, of candidates and an earlier attempt.
+        """Prove the most promising candidates, searched on or made smaller where a proof objects; return the best.
 
         Args:
-            candidates: candidates of the search. Their values are of a smoothed criterion, by which another one may be
-                the best.
-            per_period: samples per period of the search, to go on with.
+            candidates: candidates of the search. Their values are of a smoothed criterion; the exact one, used here,
+                may rank them otherwise.
+            per_period: samples per period with which the search goes on.
             seconds: time for searching on, proofs not counted [s]; no bound when None.
             cancelled: called at every evaluation; True ends searching on.
             best: an earlier attempt.
             task: task of the search that found the candidates; the task of all proofs when None.
+
+        Returns:
+            The attempt with the smallest value, whose result is None where nothing could be proven; None without
+            candidates and without `best`.
         """
         task = task or self._task
         ranked = sorted((self._value(one.coefficients), place) for place, one in enumerate(candidates))
@@ -531,16 +535,16 @@ def _searched(
                 before, looked = looked.candidates, None
             seconds -= look
     found = search(aimed, prover.safe(aimed), seed, replace(budget, seconds=seconds), per, tell, cancelled, looked)
-    best = prover.best_of(found.candidates, per, kept_back, cancelled, task=aimed)
+    best = prover.prove_best(found.candidates, per, kept_back, cancelled, task=aimed)
     # What the first look came to may be better, made smaller, than what a short or cancelled search came to after it.
-    best = prover.best_of(before[:1], per, 0.0, cancelled, best)
+    best = prover.prove_best(before[:1], per, 0.0, cancelled, best)
     if best is None:
         raise AssertionError("a search has at least one candidate")
     # What the proof objected to has had its time.
     at_once = best.task is task and not best.why and best.candidate.start >= 0
     if at_once and budget.seconds is not None and budget.starts is None and not cancelled() and left() > _SHORTEST:
         found = search(task, safe, seed, replace(budget, seconds=left()), per, tell, cancelled, found)
-        best = prover.best_of(found.candidates, per, 0.0, cancelled, best) or best
+        best = prover.prove_best(found.candidates, per, 0.0, cancelled, best) or best
     return found, best
 
 

@@ -348,14 +348,15 @@ def _malloc_trim() -> Any:
 
 
 def settle(sources: Sequence[Source], description: str) -> Settled | tuple[Problem, ...]:
-    """Return the description with every choice as a number, as recordings of one arm decide them together.
+    """Replace each automatic choice in a description by a number, decided by the first usable recordings together.
 
     Args:
-        sources: the recordings, of which the first few that can be used decide.
+        sources: recordings of one arm.
         description: the description as JSON.
 
     Returns:
-        The settled description; or what is wrong with each recording, where none can be used.
+        The settled description; or what is wrong, where no recording can be used, or the usable ones cannot be fitted
+        together.
     """
     config = ArmConfig.model_validate_json(description)
     model = arm_model(config)

@@ -120,13 +120,13 @@ class ArmFit:
 
 @one_blas_thread()
 def arm_fit(merged: Merged, method: str, between: Array | None = None) -> ArmFit:
-    """Estimate one arm from merged factors.
+    """Estimate one arm from its merged factors, by least squares without a feasible set.
 
     Args:
         merged: merged factors of the arm.
         method: `ols` gives all joints the same weight.
-        between: variances between recordings, as for `ArmFit.weighed`; None where recordings are the clusters, whose
-            covariance has them already.
+        between: variances of the arm's mean by what differs between recordings, theirs divided by their number [SI^2],
+            shape (base,), as for `ArmFit.weighed`; None where each recording is a cluster: the covariance has them.
     """
     fitted = merged.fitted
     total = fitted.total
@@ -364,30 +364,30 @@ def arm_estimate(
     merged: Merged,
     recordings: Sequence[tuple[str, str]],
     described: Described,
-    pooled: LeastSquares | None = None,
+    drawn: LeastSquares | None = None,
     arms: int = 1,
 ) -> Estimate:
-    """Return one arm's estimate inside its feasible set, as `ident identify` has it.
+    """Return one arm's estimate inside its feasible set, from `alone` or, where it is given, from `drawn` instead.
 
     Args:
         alone: unconstrained estimate of the arm alone.
         merged: merged factors of the arm.
         recordings: name and hash of each.
         described: the arm.
-        pooled: estimate of the arm, drawn to the fleet's; `alone` when None.
-        arms: number of arms in the fleet; how far they differ is known the less, the fewer they are.
+        drawn: the arm's own estimate after it was drawn to the fleet's; None for the arm alone.
+        arms: number of arms in the fleet, which sets the degrees of freedom where `drawn` is given.
 
     Raises:
         SolverError: the solver stopped without an optimum.
     """
     model, base, conditions = described.model, described.base, _conditions(described)
-    fit = alone.fit if pooled is None else pooled
+    fit = alone.fit if drawn is None else drawn
     held = constrained_least_squares(fit, base, conditions)
-    degrees = alone.doubt.degrees if pooled is None else np.full(base.size, max(arms - 2.0, 1.0))
-    deviations = alone.doubt.deviations if pooled is None else pooled.standard_deviations * widening(degrees)
-    covariance = alone.doubt.covariance if pooled is None else pooled.inverse @ pooled.inverse.T
+    degrees = alone.doubt.degrees if drawn is None else np.full(base.size, max(arms - 2.0, 1.0))
+    deviations = alone.doubt.deviations if drawn is None else drawn.standard_deviations * widening(degrees)
+    covariance = alone.doubt.covariance if drawn is None else drawn.inverse @ drawn.inverse.T
     likely = likely_bodies(model)
-    near = allowed_change(fit, base, deviations, held.beta) if held.tight and pooled is None else None
+    near = allowed_change(fit, base, deviations, held.beta) if held.tight and drawn is None else None
     held = held.centred(base, conditions, likely, near)
     everything, moving = merged.everything, merged.moving
     found = [

@@ -82,7 +82,7 @@ def pseudo_inertia(parameters: Array) -> Array:
 
 
 def from_pseudo_inertia(J: Array) -> Array:
-    """Return the parameters of eq. 13 of second moments of mass, shape (4, 4), the inverse of `pseudo_inertia`."""
+    """Return a body's parameters (eq. 13), shape (10,), from its pseudo-inertia, shape (4, 4)."""
     return body_parameters(np.trace(J[:3, :3]) * np.eye(3) - J[:3, :3], J[:3, 3], J[3, 3])
 
 

@@ -45,8 +45,8 @@ class StopSecuring(Enum):
     LOWER = "lower"  # held for a while, then lowered under damped control until it rests
 
 
-def falling_joints(model: ArmModel, limits: MotionLimits) -> tuple[str, ...]:
-    """Return the names of the joints that gravity moves when their drives are off, with or without a brake.
+def joints_with_weight(model: ArmModel, limits: MotionLimits) -> tuple[str, ...]:
+    """Return the names of the joints whose gravity torque is not negligible in some posture; brakes do not count.
 
     Args:
         model: model with prior parameters.
@@ -77,7 +77,7 @@ def after_stop(model: ArmModel, limits: MotionLimits) -> StopSecuring:
     asked = model.config.control.after_stop
     if asked in ("hold", "lower"):
         return StopSecuring(asked)
-    loose = [name for name in falling_joints(model, limits) if not model.config.has_brake(name)]
+    loose = [name for name in joints_with_weight(model, limits) if not model.config.has_brake(name)]
     if loose:
         raise MotionRefused(
             f"{model.config.name}: {', '.join(loose)} would fall after a stop: gravity moves them, and no brake is "

@@ -18,7 +18,7 @@ from ident_service.errors import ConfigError, ModelError, MotionRefused, Paramet
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import base_parameters, remarks_on_angles
 from ident_service.model.collision import CollisionModel
-from ident_service.motion.after_stop import StopSecuring, after_stop, falling_joints
+from ident_service.motion.after_stop import StopSecuring, after_stop, joints_with_weight
 from ident_service.motion.arm_factory import GROUP
 from ident_service.preflight.stability import StabilityReport, delay_of, stability
 
@@ -105,7 +105,7 @@ def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescri
     except MotionRefused as refusal:
         # Its remedies are several keys; the joints are where brakes would stand.
         objections.append(located(arm, ("control", "after_stop"), str(refusal)))
-    falling = () if model.prior is None else falling_joints(model, limits)
+    falling = () if model.prior is None else joints_with_weight(model, limits)
     if model.prior is None and config.driver is not None:
         remedy = "give `prior`, or a URDF or MJCF with the masses of its links"
         objections.append(

@@ -13,7 +13,7 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
 from ident_service.model.kinematics import frame_origins
 from ident_service.model.pinocchio_models import InverseDynamics
-from ident_service.motion.after_stop import after_stop, falling_joints
+from ident_service.motion.after_stop import after_stop, joints_with_weight
 from ident_service.motion.clearance import motion_stop_clearance, trajectory_clearance
 from ident_service.motion.run import unhurried
 from ident_service.motion.run_plan import Destination, PointToPointPlan
@@ -88,7 +88,7 @@ def long_silence(model: ArmModel, limits: MotionLimits, seconds: float | None) -
     """
     if seconds is None or seconds <= LONGEST_SILENCE or model.config.watchdog_reason:
         return ""
-    if not (falling := falling_joints(model, limits)):
+    if not (falling := joints_with_weight(model, limits)):
         return ""
     return (
         f"drives go on for {seconds:g} s when the host is gone, and {', '.join(falling)} can fall: at most "

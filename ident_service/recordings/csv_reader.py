@@ -124,9 +124,9 @@ def parse_header(path: Path, header: str, columns: Mapping[str, Column] | None =
     for ours, one in (columns or {}).items():
         if ours == "t":
             # Powers of ten and short decimals, as they are written: times keep all their digits.
-            nanoseconds *= Decimal(repr(one.scale(ours)))
+            nanoseconds *= Decimal(repr(one.si_factor(ours)))
         else:
-            scale[place[ours]] = one.scale(ours)
+            scale[place[ours]] = one.si_factor(ours)
     return CsvColumns(
         names=names,
         time=place["t"],

@@ -583,8 +583,8 @@ class CanopenDrive:
         """Return whether a frame of this identifier means anything to this drive."""
         return identifier in self._ears or 0x700 < identifier < 0x780
 
-    def traffic(self, frame: Frame) -> Traffic:
-        """Return the kind of a frame that this drive has sent."""
+    def traffic_kind(self, frame: Frame) -> Traffic:
+        """Return whether a frame that this drive has sent is position feedback, a heartbeat or another."""
         if frame.identifier == 0x700 + self._node.number:
             return Traffic.HEARTBEAT
         for number, index in enumerate(COMMUNICATION[1]):

@@ -150,8 +150,8 @@ class Body:
         self._torque = np.zeros(plant.chain.joints)
         self._driven = np.zeros(plant.chain.joints)
 
-    def start(self, now_ns: int) -> None:
-        """Start at this time, before anything has happened."""
+    def set_clock(self, now_ns: int) -> None:
+        """Set the clock to this time [ns], when the drives get power; the plant stays as it is."""
         self.now_ns = now_ns
         self._drawn_ns = now_ns - self._period_ns
 

@@ -88,7 +88,7 @@ class Emulator:
 
     def is_feedback(self, sent: Sent) -> bool:
         """Return whether a frame on its way is a drive's position in a cycle."""
-        return sent.drive is not None and self.faces[sent.drive].traffic(sent.frame) is Traffic.FEEDBACK
+        return sent.drive is not None and self.faces[sent.drive].traffic_kind(sent.frame) is Traffic.FEEDBACK
 
     @property
     def active(self) -> tuple[DriveFault, ...]:
@@ -114,7 +114,7 @@ class Emulator:
     def power_up(self, now_ns: int) -> None:
         """Give power to all drives; they send their boot-up messages with the next `tick`."""
         self._now_ns = now_ns
-        self.body.start(now_ns)
+        self.body.set_clock(now_ns)
         for face in self.faces:
             face.power_up(now_ns)
         for companion in self.companions:

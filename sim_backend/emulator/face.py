@@ -74,7 +74,7 @@ class EmulatedDevice(BusDevice, Protocol):
     def watch(self, now_ns: int) -> None:
         """Limit the torque by position and speed of the motor, during a longer silence."""
 
-    def traffic(self, frame: Frame) -> Traffic:
+    def traffic_kind(self, frame: Frame) -> Traffic:
         """Return the kind of a frame that the drive has sent."""
 
     def evaluate(self, now_ns: int) -> None:

@@ -264,7 +264,7 @@ class Injection:
         return sent
 
     def _falsified(self, drive: int, frame: Frame, now_ns: int) -> list[Sent]:
-        traffic = self._faces[drive].traffic(frame)
+        traffic = self._faces[drive].traffic_kind(frame)
         delay, sent = 0, []
         for fault in self.active:
             if fault.drive not in (None, drive):

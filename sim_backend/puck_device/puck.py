@@ -135,7 +135,7 @@ class EmulatedPuck:
             return address.destination == self._node
         return address.destination in (self.values[name] for name in _GROUPS)
 
-    def traffic(self, frame: Frame) -> Traffic:
+    def traffic_kind(self, frame: Frame) -> Traffic:
         """Return the kind of a frame that this puck has sent."""
         address = address_of(frame.identifier)
         return Traffic.FEEDBACK if address.group and address.destination == Group.POSITIONS else Traffic.OTHER

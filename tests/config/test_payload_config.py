@@ -17,7 +17,7 @@ from ident_service.errors import ConfigError, ModelError
 from ident_service.estimation.feasible.feasible_set import configured_blocks
 from ident_service.model.arm_model import arm_model
 from ident_service.model.regressor import joint_regressor
-from ident_service.motion.after_stop import falling_joints
+from ident_service.motion.after_stop import joints_with_weight
 from sim_backend.build import build_machine
 
 Array = np.ndarray
@@ -136,10 +136,10 @@ def test_it_counts_in_what_falls_and_in_what_a_motion_was_checked_for(shipped: P
     # An elbow whose link weighs nothing falls because of what it carries.
     prior = model.prior.copy()
     prior[model.layout.inertial(1)] = [*([1e-9] * 6), 0.0, 0.0, 0.0, 1e-6]
-    assert falling_joints(replace(model, prior=prior), limits) == ("shoulder",)
+    assert joints_with_weight(replace(model, prior=prior), limits) == ("shoulder",)
     loaded = prior.copy()
     loaded[model.layout.inertial(1)] += Payload(mass=MASS, center_of_mass=CENTER).parameters
-    assert falling_joints(replace(model, prior=loaded), limits) == ("shoulder", "elbow")
+    assert joints_with_weight(replace(model, prior=loaded), limits) == ("shoulder", "elbow")
 
 
 def test_descriptions_without_one_keep_their_hash() -> None:

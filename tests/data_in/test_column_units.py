@@ -58,7 +58,7 @@ def read(folder: Path, text: str, layout: RecordingFormat) -> tuple[list[int], l
     ],
 )
 def test_a_number_times_this_is_si(name: str, column: dict[str, Any], factor: float) -> None:
-    assert Column(column="theirs", **column).scale(name) == pytest.approx(factor, rel=1e-15)
+    assert Column(column="theirs", **column).si_factor(name) == pytest.approx(factor, rel=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_times_in_other_units_are_pointed_at(tmp_path: Path) -> None:
 def test_whole_units_of_time_are_exact(count: int, unit: tuple[str, int]) -> None:
     name, digits = unit
     number = count // 10**digits
-    scale = Column(column="t", unit=name).scale("t")
+    scale = Column(column="t", unit=name).si_factor("t")
     assert number * Decimal(repr(scale)) * 10**9 == number * 10**digits
 
 
@@ -153,7 +153,7 @@ def test_a_factor_of_one_that_is_given_is_given_still_after_it_was_kept() -> Non
     """A results folder keeps the description, and identifies from it again."""
     column = Column(column="theirs", unit="A", factor=1.0)
     again = Column.model_validate_json(column.model_dump_json())
-    assert again.scale("tau1") == 1.0
+    assert again.si_factor("tau1") == 1.0
 
 
 ODD_COLUMNS = """\

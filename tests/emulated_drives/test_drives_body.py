@@ -62,7 +62,7 @@ def test_at_the_nominal_period_it_is_the_simulated_arm_to_the_bit(tmp_path: Path
     # Home is the same without the limits, which would clip what the simulated arm makes of a torque.
     assert (machine.plant.position == body.plant.position).all()
     machine.enable()
-    body.start(0)
+    body.set_clock(0)
     random = np.random.default_rng(1)
     for cycle in range(500):
         at_motors = random.uniform(-0.5, 0.5, 2)
@@ -80,7 +80,7 @@ def test_uneven_cycles_lead_to_nearly_the_same_place(tmp_path: Path) -> None:
     ends = []
     for divided in (False, True):
         body = body_of(tmp_path)
-        body.start(0)
+        body.set_clock(0)
         now = 0
         for motor in body.motors:
             motor.drive(0.1, 0)
@@ -96,7 +96,7 @@ def test_uneven_cycles_lead_to_nearly_the_same_place(tmp_path: Path) -> None:
 def test_a_long_silence_is_watched_in_steps(tmp_path: Path) -> None:
     body, seen = body_of(tmp_path), []
     body.watch = seen.append
-    body.start(0)
+    body.set_clock(0)
     for motor in body.motors:
         motor.drive(0.0, 0)
     body.advance(10 * MS)
@@ -124,7 +124,7 @@ def test_nobody_falls_before_all_motors_have_power_and_some_torque(tmp_path: Pat
 def test_braking_takes_the_energy_that_motors_turn_into_heat(tmp_path: Path, braked: tuple[int, ...]) -> None:
     body = body_of(tmp_path)
     plant, gears = body.plant, body.gears
-    body.start(0)
+    body.set_clock(0)
     for motor in body.motors:
         motor.drive(0.05, 0)
     body.advance(200 * MS)

@@ -295,7 +295,7 @@ def test_what_a_proof_objects_to_is_searched_for_again_and_not_only_made_smaller
         return criterion_of(task, task.basis.path(coefficients), base)
 
     prover = Prover(model, task, safe, design.torque_margin, value, lambda path: None)
-    smaller, mended = (prover.best_of([best], per_period(task.basis), time, lambda: False) for time in (0.0, None))
+    smaller, mended = (prover.prove_best([best], per_period(task.basis), time, lambda: False) for time in (0.0, None))
     assert smaller is not None
     assert reason in smaller.why
     assert smaller.value > value(best.coefficients) + 0.01

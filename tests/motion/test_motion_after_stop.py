@@ -19,7 +19,7 @@ from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.model.collision import lowest_point
 from ident_service.model.kinematics import link_poses
-from ident_service.motion.after_stop import SPEED, StopSecuring, after_stop, falling_joints
+from ident_service.motion.after_stop import SPEED, StopSecuring, after_stop, joints_with_weight
 from ident_service.motion.command_channel import ControlFile, Homing, SupervisedCommands
 from ident_service.motion.control_loop import LEADS, LOWERS, WAITS
 from ident_service.motion.faults import ActiveFaults
@@ -134,9 +134,9 @@ def test_an_arm_that_does_not_fall_need_not_say_anything() -> None:
     rows = {"shoulder": {"type": "prismatic", "alpha": np.pi / 2}, "elbow": {"type": "prismatic"}}
     sliders = {"dh": {"convention": "standard", "joints": rows}}
     level = loose(None, kinematics=sliders, joints=joints, gravity=(-9.81, 0.0, 0.0))
-    assert falling_joints(arm_model(level), motion_limits(level)) == ()
+    assert joints_with_weight(arm_model(level), motion_limits(level)) == ()
     steep = loose(None, kinematics=sliders, joints=joints, gravity=(0.0, 0.0, -9.81))
-    assert falling_joints(arm_model(steep), motion_limits(steep)) == ("shoulder",)
+    assert joints_with_weight(arm_model(steep), motion_limits(steep)) == ("shoulder",)
 
 
 def resolved(config: Any) -> StopSecuring:

@@ -81,7 +81,7 @@ class IdentifiedSet:
 
 
 def identified_set(service: Service, run: str) -> IdentifiedSet | None:
-    """Return the parameters of a run; None where it has none, or a file that cannot be read."""
+    """Return what pages show of a run's parameters; None where it has no parameter file, or one that cannot be read."""
     files = known.run_files(service.db, service.state, run)
     if PARAMETERS not in files:
         return None

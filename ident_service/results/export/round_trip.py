@@ -55,7 +55,7 @@ def torque(model: ArmModel, delta: Array, states: States) -> Array:
 
 
 def with_terms(model: ArmModel, delta: Array, terms: Collection[JointTerm]) -> Array:
-    """Return the link parameters with all joint terms zero that are not named."""
+    """Return a copy of the parameters in which the joint terms in `terms` are kept and all others are zero."""
     kept, layout = np.array(delta, dtype=float), model.layout
     for term in layout.terms:
         if term not in terms:
