@@ -25,7 +25,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
-from ident_service.errors import RecordingError
+from ident_service.errors import RecordingError, RecordingNotWritten
 from ident_service.model.limited_process import own_module
 from ident_service.recordings.cycle import Cycle
 from ident_service.recordings.mcap_writer import RecordingWriter
@@ -174,7 +174,7 @@ class RecorderProcess:
         """Wait until all that was put is written and the process has ended; a second time only repeats its error.
 
         Raises:
-            RecordingError: a sample could not be written, records were lost, the file cannot be finished, or the
+            RecordingNotWritten: a sample could not be written, records were lost, the file cannot be finished, or the
                 process died, and then what it had written is in `<path>.partial`.
         """
         if self._process is not None:
@@ -196,7 +196,7 @@ class RecorderProcess:
             finally:
                 self._release(patience=_FAREWELL_S)
         if self._error:
-            raise RecordingError(self.path, self._error)
+            raise RecordingNotWritten(self.path, self._error)
 
     def _start(self) -> None:
         command, environment = own_module("ident_service.recordings.recorder_main")

@@ -22,7 +22,7 @@ from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Final
 
-from ident_service.errors import RecordingError
+from ident_service.errors import RecordingError, RecordingNotWritten
 from ident_service.recordings import ring_buffer as at
 from ident_service.recordings.cycle import Cycle
 from ident_service.recordings.ring_buffer import RingWriter, State
@@ -162,7 +162,7 @@ class RingSink:
         """Wait until few enough records are waiting to be taken; returns True.
 
         Raises:
-            RecordingError: the recorder failed or died, or took nothing for longer than our patience.
+            RecordingNotWritten: the recorder failed or died, or took nothing for longer than our patience.
         """
         words, written = self._words, self.writer.written
         if written % _LOOK_EVERY == 0 and self._recorder.poll(0):
@@ -171,13 +171,13 @@ class RingSink:
         cursor = words[at.CURSOR]
         while True:
             if words[at.STATE] != State.RUNNING or self._gone:
-                raise RecordingError(self._path, self.error or "the recorder has ended")
+                raise RecordingNotWritten(self._path, self.error or "the recorder has ended")
             if written - words[at.CURSOR] <= self._most:
                 return True
             if words[at.CURSOR] != cursor:
                 cursor, deadline = words[at.CURSOR], time.monotonic() + self._patience
             if (left := deadline - time.monotonic()) <= 0:
-                raise RecordingError(self._path, f"the recorder has taken nothing for {self._patience:g} s")
+                raise RecordingNotWritten(self._path, f"the recorder has taken nothing for {self._patience:g} s")
             os.eventfd_write(self._ends.work, 1)
             for fd, _ in self._room.poll(left * 1e3):
                 if fd == self._ends.room:

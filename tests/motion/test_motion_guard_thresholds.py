@@ -179,14 +179,14 @@ def test_a_small_joint_may_go_from_no_torque_to_all_in_ten_milliseconds() -> Non
 
 
 class Heard(FrozenEncoderObserver):
-    """An observer that keeps the directions it was told."""
+    """An observer that keeps the steps it was told."""
 
-    def update(self, direction: Vector, *others: Vector) -> Array:
-        self.directions = [*getattr(self, "directions", []), direction.tolist()]
-        return super().update(direction, *others)
+    def update(self, steps: Vector, *others: Vector) -> Array:
+        self.steps = [*getattr(self, "steps", []), steps.tolist()]
+        return super().update(steps, *others)
 
 
-def test_the_observer_gets_the_direction_of_each_position() -> None:
+def test_the_observer_gets_the_step_of_each_position() -> None:
     model = bench_model()
     assert model.prior is not None
     dynamics = InverseDynamics(model.chain, model.layout, model.prior)
@@ -194,7 +194,7 @@ def test_the_observer_gets_the_direction_of_each_position() -> None:
     bench, step = Bench(encoder_observer=heard), 1e-5 * np.array([1.0, -1.0])
     for position, valid in ((HOME, (True, True)), (HOME + step, (True, True)), (HOME, (True, False))):
         bench.see(position, valid=valid, answer=STILL)
-    assert heard.directions == [[0.0, 0.0], [1.0, -1.0], [-1.0, 0.0]]
+    np.testing.assert_allclose(heard.steps, [[0.0, 0.0], step, [-step[0], 0.0]], rtol=1e-9)
 
 
 @pytest.mark.parametrize("joint", [0, 1])

@@ -17,7 +17,7 @@ from record_samples import read_all
 from recorder_bench import URDF, WHAT, actor, await_stream, caught_up, check_prefix, cycles, ending, paced, process
 from ring_actors import STEP_NS, holders, inode, record, store
 
-from ident_service.errors import RecordingError, UsageError
+from ident_service.errors import RecordingError, RecordingNotWritten, UsageError
 from ident_service.recordings.cycle import Cycle
 from ident_service.recordings.mcap_reader import McapRecording
 from ident_service.recordings.mcap_writer import RecordingWriter
@@ -180,7 +180,7 @@ def test_a_full_disk_is_reported_with_its_reason(tmp_path: Path, lock_step: bool
             assert recorder.error == "cannot be written: File too large"
             assert recorder.overruns == 2
 
-    with pytest.raises(RecordingError, match="cannot be written: File too large"):
+    with pytest.raises(RecordingNotWritten, match="cannot be written: File too large"):
         loop()
     assert recorder.error == "cannot be written: File too large"
     assert not (tmp_path / "run").exists()

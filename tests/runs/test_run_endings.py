@@ -63,6 +63,9 @@ def when(monkeypatch: pytest.MonkeyPatch, then: dict[str, Callable[[], None]]) -
 def test_a_full_disk_is_the_fault_that_it_is(
     form: str, words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
+    # Long enough for a busy machine: a recording that is nearly whole when the disk fills has failed without a fault.
+    arm = written(tmp_path / "arm.yaml", "{kind: seeded, seed: 1, base_frequency: 0.4, harmonics: 2, periods: 6}")
+    write_checked_ticket(load_arm(arm), tmp_path / "state")
     monkeypatch.setenv(TAG, "disk")
     run = tmp_path / "run"
 
