@@ -198,7 +198,7 @@ class FrozenEncoderObserver:
             return self._none
         change, inertia = np.array(shifts), encoders.inertias(self._dynamics.mass_matrix(position))
         braking = np.maximum(-np.array(self._slid) * (inertia * self._base_answer + self._base_fed), 0.0)
-        stopping = (braking + self._standing) / inertia * self._period**2  # the longest step that ends at rest, twice
+        stopping = (braking + self._standing) / inertia * self._period**2  # twice the longest step that ends at rest
         rests = np.array(self._step) <= stopping
         allowed = np.where(rests, np.minimum(np.array(most) + braking, self._standing), most)
         own = np.sign(change) * (inertia * (answer - self._base_answer) + fed - self._base_fed)

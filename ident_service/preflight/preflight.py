@@ -456,8 +456,12 @@ class _Preflight:
             self._passed(failed(code, str(error), remedy))
 
     def _left_behind(self, words: str) -> None:
-        """Record which drives have not confirmed that they are off: with what failed last, else as failed by itself."""
-        bad = [check for check in self.checks.values() if check.verdict is Verdict.FAILED]
+        """Record which drives have not confirmed that they are off, with what failed last of the arm's own checks.
+
+        Not with a check of the motion, since the path home may begin although that failed.
+        """
+        failures = (check for check in self.checks.values() if check.verdict is Verdict.FAILED)
+        bad = [check for check in failures if check.code not in ABOUT_THE_MOTION]
         if bad:
             self._passed(replace(bad[-1], reason=f"{bad[-1].reason}; {words}"))
         else:

@@ -43,7 +43,7 @@ PLOTS = """
 
 
 def cut(written: list[Any]) -> list[Any]:
-    """What goes over an edge of its canvas."""
+    """Return the texts that go over an edge of their canvas."""
     return [one for one in written if one[1] < 0 or one[2] > one[3]]
 
 

@@ -64,6 +64,18 @@ def test_with_a_motion_that_does_not_fit() -> None:
     assert for_a_way_home(ticket) == ["checks failed: gravity"]
 
 
+def test_a_drive_that_may_have_power_forbids_the_way_home_too() -> None:
+    """Recorded with the motion that does not fit, as what failed last, it would forbid that motion alone."""
+    flight = Flight()
+    other = Flight(changes={"gravity": (0.0, -9.8, 0.0)}).motion
+    assert for_a_way_home(checked(flight, flight.arm, other)) == []
+    flight = Flight()
+    flight.arm.unconfirmed = lambda: ("elbow: drive 2: no answer",)  # type: ignore[method-assign]
+    ticket = checked(flight, flight.arm, other)
+    assert for_a_way_home(ticket) == ["checks failed: watchdog"]
+    assert check_of(ticket, "watchdog").reason == "when the arm was closed: elbow: drive 2: no answer"
+
+
 @pytest.mark.slow
 def test_when_every_check_has_been_made(unnamed: Flown) -> None:
     """Nobody typed the arm's name, so that the watchdog's check stands; then the bus goes while torque fades."""
