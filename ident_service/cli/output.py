@@ -60,7 +60,7 @@ def print_error(kind: str, message: str, code: int, more: Mapping[str, object] |
 
 
 def print_to_person(text: str) -> None:
-    """Write text, which has its own line breaks, to stderr; a stderr that cannot be written to is ignored."""
+    """Write text, which has its own line breaks, to stderr; that there is none, or its disk is full, is ignored."""
     with suppress(OSError):
         write(sys.stderr, text)
 
