@@ -410,7 +410,7 @@ def _nearly_none(joints: Sequence[JointQuality], model: ArmModel) -> Iterator[st
         limit = None if described is None else described.torque
         if limit is None or torque_missing(seen):
             return
-        shares.append(max(-seen.torque[0], seen.torque[1]) / limit)
+        shares.append(max(map(abs, seen.torque)) / limit)
     if max(shares) < _WEAKEST:
         yield (
             f"no torque is ever more than {100.0 * max(shares):.2g} % of its joint's limit, less than its friction:"

@@ -388,7 +388,8 @@ def settle(sources: Sequence[Source], description: str) -> Settled | tuple[Probl
         try:
             settled = prepare(usable, model, base, conditions).model.config
         except _UNUSABLE as error:
-            return (*problems, _problem(sources[0], "", error))
+            # It is of all of them: the fit does not say whose.
+            return (*problems, replace(_problem(sources[0], "", error), url=", ".join(pilots)))
     options = settled.identification
     method: Method = "wls" if options.method == "choose" else options.method
     settled = settled.model_copy(update={"identification": options.model_copy(update={"method": method})})

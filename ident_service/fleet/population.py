@@ -119,21 +119,18 @@ class ArmFit:
 
 
 @one_blas_thread()
-def arm_fit(merged: Merged, method: str, between: Array | None = None) -> ArmFit:
+def arm_fit(merged: Merged, method: str) -> ArmFit:
     """Estimate one arm from its merged factors, by least squares without a feasible set.
 
     Args:
         merged: merged factors of the arm.
         method: `ols` gives all joints the same weight.
-        between: variances of the arm's mean by what differs between recordings, theirs divided by their number [SI^2],
-            shape (base,), as for `ArmFit.weighed`; None where each recording is a cluster: the covariance has them.
     """
     fitted = merged.fitted
     total = fitted.total
     fit = ordinary_least_squares(total) if method == "ols" else weighted_least_squares(total)
     error = torque_error(merged.everything, fit.beta)
-    found = ArmFit.of(fit, uncertainty(fitted, fit), len(merged.clusters), total, error)
-    return found if between is None else found.weighed(between)
+    return ArmFit.of(fit, uncertainty(fitted, fit), len(merged.clusters), total, error)
 
 
 def _widened(precision: Array, variances: Array) -> Array:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.fleets import BEGIN, WEEK, Kind, kind, write_recording
+from helpers.fleets import BEGIN, WEEK, Kind, kind, samples, write_recording, write_samples
 
 from ident_service import __version__
 from ident_service.errors import UsageError
@@ -32,6 +32,7 @@ from ident_service.fleet.factor import (
 )
 from ident_service.fleet.storage import Store, find
 from ident_service.operations.recordings import open_for_arm
+from ident_service.recordings.mcap_writer import RecordingWriter
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +73,22 @@ def rows(folder: Path, described: Described, store: Store) -> list[Row]:
 def reduced(path: Path, described: Described, store: Store, **more: bool) -> Outcome:
     (source,) = find([str(path)])
     return reduce_recording(Part(source), described, store, __version__, **more)
+
+
+def test_recordings_that_cannot_be_fitted_together_are_all_named(usual: Kind, tmp_path: Path) -> None:
+    """An unreadable file before them has its own reason and is not named for theirs."""
+    (tmp_path / "0.mcap").write_bytes(b"no recording")
+    position, _, torque = samples(usual, usual.truth, seed=0)
+    rest = np.zeros_like(position)
+    for name in ("1.mcap", "2.mcap"):
+        with RecordingWriter(tmp_path / name, usual.model.chain.names, "", round(BEGIN * 1e9)) as writer:
+            write_samples(writer, round(BEGIN * 1e9), usual.stamps(len(rest)), rest, rest, np.ones_like(torque))
+    problems = settle(find([str(tmp_path)]), usual.model.config.model_dump_json())
+    assert not isinstance(problems, Settled)
+    unreadable, at_rest = problems
+    assert unreadable.url == str(tmp_path / "0.mcap")
+    assert at_rest.url == f"{tmp_path / '1.mcap'}, {tmp_path / '2.mcap'}"
+    assert "never faster than" in at_rest.message
 
 
 def test_settled_choices_are_numbers(described: Described) -> None:

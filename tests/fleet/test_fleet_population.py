@@ -259,7 +259,7 @@ def test_what_follows_from_an_arms_factors_is_made_once(
     ]
     single, held = merged(rows[0]), merged(rows[1])
     assert errors[1] == pytest.approx(
-        held_out_errors(arm_fit(single, "wls", between), held, found.other_arms("3"), found.scale, DESCRIBED)
+        held_out_errors(arm_fit(single, "wls").weighed(between), held, found.other_arms("3"), found.scale, DESCRIBED)
     )
 
     def again(*_: object, **__: object) -> None:

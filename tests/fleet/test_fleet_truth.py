@@ -104,7 +104,7 @@ def whole(of: Sequence[Reduction]) -> Merged:
 def fitted(arms: Mapping[str, Sequence[Reduction]], described: Described) -> dict[str, ArmFit]:
     """Estimate each arm alone."""
     shares = variance_shares({arm: [one.recorded.row for one in of] for arm, of in arms.items()}, described.groups)
-    return {arm: arm_fit(whole(of), "wls", shares.recordings / len(of)) for arm, of in arms.items()}
+    return {arm: arm_fit(whole(of), "wls").weighed(shares.recordings / len(of)) for arm, of in arms.items()}
 
 
 def compared(arms: Mapping[str, Sequence[Reduction]], described: Described) -> Compared:
