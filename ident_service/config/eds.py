@@ -68,6 +68,11 @@ class DataSheetEntry:
         """Return whether a host may write the entry."""
         return self.access in ("rw", "rww", "rwr", "wo")
 
+    @property
+    def readable(self) -> bool:
+        """Return whether a host may read the entry."""
+        return self.access != "wo"
+
     def number(self, node: int) -> int | None:
         """Return the entry's value as a number, None where it has none.
 

@@ -260,7 +260,7 @@ def _configured(file: TextFile, node: int) -> dict[int, Write]:
     found, wrong = {}, []
     for key, entry in sorted(sheet.entries.items()):
         kind = _NUMBERS.get(entry.kind)
-        if not entry.configured or not entry.writable or kind is None:
+        if not (entry.configured and entry.writable and entry.readable) or kind is None:
             continue
         try:
             found[key] = Write(Entry(key >> 8, key & 0xFF, kind, "value of the DCF"), _value(key, entry, kind, node))
@@ -286,6 +286,8 @@ def _left_out(file: TextFile) -> dict[str, str]:
         name = where(Entry(key >> 8, key & 0xFF, Kind.U32, ""))
         if not entry.writable:
             found[name] = "read-only"
+        elif not entry.readable:
+            found[name] = "write-only: it could be neither compared nor set back"
         elif entry.kind not in _NUMBERS:
             found[name] = f"{_TYPES.get(entry.kind, f'type {entry.kind:04X}h')} is not imported"
         elif not entry.configured:

@@ -224,18 +224,20 @@ def test_every_wrong_value_counts_and_limits_of_the_file_too() -> None:
 def test_a_value_that_cannot_be_imported_is_named() -> None:
     config = arm_of(EPOS4)
     own = {"6041": "7", "6502": "x", "1018sub4": "9"}  # read-only; the last is compared by hosts, and never written
-    own |= {"21A0sub1": "1.5", "21A0sub2": "a drive", "21A0sub3": "0x500"}
+    own |= {"21A0sub1": "1.5", "21A0sub2": "a drive", "21A0sub3": "0x500", "21A0sub4": "5"}
     text = sheet(EPOS4)["text"]
-    for number, kind, default in ((1, "0x8", "0"), (2, "0x9", ""), (3, "0x7", "$NODEID+0x400")):
-        text += f"\n[21A0sub{number}]\nDataType={kind}\nAccessType=rw\nDefaultValue={default}\n"
+    added = (("0x8", "rw", "0"), ("0x9", "rw", ""), ("0x7", "rw", "$NODEID+0x400"), ("0x7", "wo", "0"))
+    for number, (kind, access, default) in enumerate(added, 1):
+        text += f"\n[21A0sub{number}]\nDataType={kind}\nAccessType={access}\nDefaultValue={default}\n"
     files = [dcf(text, **{NOMINAL: 4000}, **own)] * 2
     bench = Bench(config)
     for dry in (True, False):
         found = import_configuration(config, files, dry=dry, open_bus=bench.links)  # type: ignore[arg-type]
-        assert list(found[1].left_out) == ["21A0h:01", "21A0h:02", "21A0h:03", "6041h", "6502h"]
+        assert list(found[1].left_out) == ["21A0h:01", "21A0h:02", "21A0h:03", "21A0h:04", "6041h", "6502h"]
         text = imported_text(config, found, dry=dry)
         assert "  left out        21A0h:01 (REAL32 is not imported); 21A0h:02 (VISIBLE_STRING is" in text
-        assert "21A0h:03 (of a node number, which is the drive's own); 6041h, 6502h (read-only)\n" in text
+        assert "21A0h:03 (of a node number, which is the drive's own); 21A0h:04 (write-only: it could be" in text
+        assert "neither compared nor set back); 6041h, 6502h (read-only)\n" in text
         assert drives_document(config, found)["drives"][0]["left_out"]["6041h"] == "read-only"
     with pytest.raises(UsageError, match=r"none of its values can be imported: 6041h \(read-only\)$"):
         import_configuration(config, [dcf(**{"6041": 7})] * 2, dry=True, open_bus=no_bus)
