@@ -4,7 +4,8 @@ At the best motion the criterion's gradient is balanced by those of the limits t
 with `lambda >= 0` (Karush-Kuhn-Tucker). A limit L whose share is `c = |s| / L - 1` then costs
 `lambda = -df / d(log L)`. A criterion that is the logarithm of something changes that by the factor `r^lambda` where
 the limit is r times as wide.
-That is the slope at this motion, which far away from it is no more than a guess.
+That is the slope at this motion, which far away from it is no more than a guess; where another limit is reached on the
+way, it is too high.
 
 The forecast following error is inversely proportional to the joint's position gain, so that a stiffer one pays like a
 wider limit. It also takes part of the velocity limit, in which the arm catches up; stiffer gains leave less of that.
@@ -131,7 +132,7 @@ def active_limit_lines(
     for one in found[:_MOST_LISTED]:
         if one.exponent < _WORTH_TELLING:
             break
-        gain = f"would give about {gain_words(task.criterion, 2.0**one.exponent)}"
+        gain = f"could give up to about {gain_words(task.criterion, 2.0**one.exponent)}"
         if one.joint is None:
             what = "the supply's power" if one.limit == "power" else "clearance"
             # Clearance is scaled by a depth, so that the gain for twice the limit has no meaning.

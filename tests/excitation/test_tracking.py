@@ -182,7 +182,7 @@ def test_a_wider_active_limit_gains_as_predicted() -> None:
     more = from_there(replace(task, limits=replace(task.limits, velocity=velocity)))
     assert best.value - more.value == pytest.approx(expected * np.log(1.1), rel=0.3)
     words = active_limit_lines(found, task, motion_limits(model.config), task.limits.velocity, ("rad", "rad"))
-    assert any("elbow is limited by its velocity; 1.2 would give about" in line for line in words)
+    assert any("elbow is limited by its velocity; 1.2 could give up to about" in line for line in words)
 
 
 @pytest.fixture(scope="module")
@@ -222,7 +222,7 @@ def test_gains_are_proposed_only_as_stiff_as_is_stable(
         return about
 
     assert words(1.01 * most).startswith(
-        "elbow is limited to 30% of its velocity by following_error; 0.1 rad would give"
+        "elbow is limited to 30% of its velocity by following_error; 0.1 rad could give"
     )
     assert words(1.01 * most).endswith(
         f"; with kp {most:.0f} and kd {12.0 * np.sqrt(most / 40.0):.3g} it would follow at its velocity limit"
