@@ -154,7 +154,7 @@ def _run(words: Sequence[str], *, completes: bool) -> int:
         notes = list(getattr(error, "__notes__", ()))
         head = styled(sys.stderr, "ident:", "error")
         said = with_arm(arguments, "\n".join([str(error), *notes]))
-        print_to_person(f"{head} {said}\n{next_after_error(arguments, error)}")
+        print_to_person(f"{head} {said}\n{next_after_error(arguments, type(error), str(error))}")
         if arguments.json:
             more: dict[str, object] = {"notes": notes} if notes else {}
             more |= {"text": "".join(f"{note}\n" for note in notes)} if arguments.with_text else {}

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from ident_service import errors
 from ident_service.cli.arguments import LOCAL_ONLY
 from ident_service.cli.output import DONE, VERDICT_NO, state_folder
 from ident_service.errors import ArmFault, IdentError, MotionRefused, PositionUnknown
@@ -82,6 +83,8 @@ def next_line(arguments: argparse.Namespace, code: int, document: Mapping[str, A
     ended = Ended(arguments, code, said, run)
     if run and not ended.remote:
         ended = replace(ended, run=ended.short(run))
+    if job is not None and (refusal := _job_refusal(arguments, said)):
+        return refusal
     try:
         words = None if follows is None else follows(ended)
     except (LookupError, AttributeError, TypeError):  # an answer of another version; what is done stays done
@@ -89,21 +92,30 @@ def next_line(arguments: argparse.Namespace, code: int, document: Mapping[str, A
     return "" if words is None else f"next: {command(arguments, words)}\n"
 
 
-def next_after_error(arguments: argparse.Namespace, error: IdentError) -> str:
+def _job_refusal(arguments: argparse.Namespace, said: Mapping[str, Any]) -> str:
+    """Return `next_after_error` for the error that a job's command ended with; empty where it ended otherwise."""
+    error = said.get("error")
+    if not isinstance(error, dict):
+        return ""
+    kind = getattr(errors, str(error.get("kind")), IdentError)
+    return next_after_error(arguments, kind, str(error.get("message", "")))
+
+
+def next_after_error(arguments: argparse.Namespace, kind: type[IdentError], message: str) -> str:
     """Return the line that names the command which clears what stopped or refused a motion; empty for other errors."""
     arm = getattr(arguments, "arm", None)
-    if arguments.word == "reidentify" and "nothing has been accepted" in str(error):
+    if arguments.word == "reidentify" and "nothing has been accepted" in message:
         return f"next: {command(arguments, ['preflight', str(arm)])}\n"
-    if arm is not None and isinstance(error, PositionUnknown):
+    if arm is not None and issubclass(kind, PositionUnknown):
         return f"next: {command(arguments, ['set-home', str(arm)])}\n"
-    if arm is None or not isinstance(error, ArmFault | MotionRefused):
+    if arm is None or not issubclass(kind, ArmFault | MotionRefused):
         return ""
-    if "a motion needs joints." in str(error):  # the description lacks them
+    if "a motion needs joints." in message:  # the description lacks them
         return f"next: {command(arguments, ['config', 'check', str(arm)])}\n"
     if arguments.word in _WITHOUT_ARM:
         return ""
     words = ["recover", str(arm)]
-    if "preflight" in str(error) and not isinstance(error, ArmFault):
+    if "preflight" in message and not issubclass(kind, ArmFault):
         slow = arguments.word in ("home", "recover")
         words = ["preflight", str(arm), *(["--home"] if slow else Ended(arguments, 0, {}, "").motion)]
     return f"next: {command(arguments, words)}\n"

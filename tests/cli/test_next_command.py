@@ -142,7 +142,13 @@ ERRORS: list[tuple[str, IdentError, str]] = [
 def test_what_refused_or_stopped_a_motion_is_followed_by_what_clears_it(
     words: str, error: IdentError, line: str
 ) -> None:
-    assert next_after_error(TOP.parse_args(words.split()), error) == line
+    assert next_after_error(TOP.parse_args(words.split()), type(error), str(error)) == line
+    if line:  # a daemon's job ends with the same error, in JSON
+        arguments = TOP.parse_args([*words.split(), "--server", "http://pc:8000"])
+        answer = {"error": {"kind": type(error).__name__, "message": str(error)}}
+        job = JOB | {"state": "failed", "motion": True}
+        expected = line.replace("\n", " --server http://pc:8000\n")
+        assert next_line(arguments, 1, {"job": job, "answer": answer}) == expected
 
 
 @pytest.mark.parametrize(

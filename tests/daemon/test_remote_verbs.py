@@ -394,6 +394,8 @@ def test_a_person_elsewhere_reads_what_one_at_the_machine_does(
         assert "\nnext: ident preflight quick --state " in capsys.readouterr().out
         # The commands that are named can be given as they stand.
         fault_file(state, "quick").latch("late_cycle", "a cycle came late")
+        assert main(["preflight", "quick", "--confirm", "quick", *server]) != 0
+        assert "\nnext: ident recover quick --state " in capsys.readouterr().out
         assert main(["recover", "quick", *server]) == 3
         said = capsys.readouterr().out
         told, _, following = said.partition("\nnext: ")
