@@ -77,7 +77,7 @@ class Chain:
         return len(self.names)
 
     def ancestors(self, joint: int) -> tuple[int, ...]:
-        """Return the joints that move `joint`'s link, from the base outwards, `joint` itself included."""
+        """Return the indices of the joints that move `joint`'s link, from the base outwards, `joint` included."""
         path = [joint]
         while (parent := self.parents[path[-1]]) != WORLD:
             path.append(parent)
@@ -85,13 +85,13 @@ class Chain:
 
 
 def rotation_x(angle: float) -> Array:
-    """Return the rotation about x by `angle` [rad], shape (3, 3)."""
+    """Return the rotation matrix about x by `angle` [rad], shape (3, 3)."""
     c, s = _clean(np.cos(angle)), _clean(np.sin(angle))
     return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
 
 
 def rotation_z(angle: float) -> Array:
-    """Return the rotation about z by `angle` [rad], shape (3, 3)."""
+    """Return the rotation matrix about z by `angle` [rad], shape (3, 3)."""
     c, s = _clean(np.cos(angle)), _clean(np.sin(angle))
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
