@@ -172,7 +172,7 @@ class FourierPath(_Sampled):
 
     @property
     def distinct(self) -> tuple[tuple[float, float], ...]:
-        """Return the times of both ramps and of one period [s]."""
+        """Return (begin, end) [s] of the first ramp, first period and last ramp; only the period without ramps."""
         full = (self.ramp, self.ramp + self.series.period)
         if self.ramp == 0.0:
             return (full,)
@@ -312,7 +312,7 @@ class Basis(Protocol):
 
     @property
     def moving(self) -> NDArray[np.bool_]:
-        """Return a mask of coefficients that are zero in standing still, or may differ there; shape (size,)."""
+        """Return a mask of the coefficients that can make the arm move; others only set its place; (size,)."""
 
     def path(self, coefficients: Array) -> FourierPath | PosturePath:
         """Return the motion with coefficients of shape (joints, size)."""

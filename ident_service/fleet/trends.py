@@ -297,7 +297,7 @@ def _carried(recordings: Sequence[Recorded]) -> Array:
 def dependences(
     arms: Mapping[str, Sequence[Recorded]], groups: Mapping[Group, Sequence[int]], scatter: Mapping[Group, Scatter]
 ) -> list[Dependence]:
-    """Regress every base parameter on the conditions that recordings carry, each arm with a level of its own."""
+    """Regress every base parameter on each recorded condition, with a level per arm; return slopes with p-values."""
     every = []
     for name in CONDITIONS.values():
         carrying = {arm: [one for one in recordings if name in one.row.conditions] for arm, recordings in arms.items()}

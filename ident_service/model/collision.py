@@ -422,7 +422,7 @@ def lowest_point(model: ArmModel) -> Callable[[Array], float]:
 
 
 def geometry(around: Scene, contacts: Sequence[tuple[int, int]]) -> tuple[pin.GeometryModel, pin.GeometryData]:
-    """Return all bodies as coal geometry, with the data for the distances of some pairs of them.
+    """Build coal geometry of all bodies, and the data object for the distances of the given pairs of them.
 
     Args:
         around: the bodies.
@@ -494,7 +494,7 @@ class Contact:
         self.clear.setflags(write=False)
 
     def depths(self, position: Array) -> Array:
-        """Return the penetration depth of each pair of solids that is checked in this call.
+        """Return the penetration depth [m] of the pairs checked in this call, positive in overlap; -inf for others.
 
         Args:
             position: [rad or m], shape (joints,).

@@ -21,7 +21,9 @@ from ident_service.model.chain import Array
 
 
 def presliding_distances(model: ArmModel) -> Array:
-    """Return the pre-sliding distance x0 per drive [rad or m], shape (joints,).
+    """Return the pre-sliding distance x0 per drive [rad or m], shape (joints,); zero where none applies.
+
+    That is where dry friction turns round at once: nothing was fitted, or the arm has no dry friction.
 
     Zero where dry friction turns round at once: nothing was fitted, or the arm has no dry friction.
     """
@@ -32,7 +34,7 @@ def presliding_distances(model: ArmModel) -> Array:
 
 
 def advance_dahl_state(direction: Array, step: Array, lengths: Array) -> Array:
-    """Return the direction of dry friction after a step.
+    """Return the dry-friction direction of each drive, -1 to 1, after a step without reversal (Dahl 1968).
 
     Args:
         direction: direction before the step, between -1 and 1, shape (..., drives).
@@ -48,7 +50,7 @@ def advance_dahl_state(direction: Array, step: Array, lengths: Array) -> Array:
 
 
 def friction_direction(rate: Array, period: float, presliding: Array, start: Array | None = None) -> Array:
-    """Return the direction of friction of each drive, between -1 and 1.
+    """Return the dry-friction direction of each drive at each sample, -1 to 1, shape (samples, drives).
 
     Args:
         rate: drive velocities [rad/s or m/s], shape (samples, drives).

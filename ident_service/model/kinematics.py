@@ -8,7 +8,7 @@ from ident_service.model.chain import WORLD, Array, Chain
 
 
 def frame_origins(chain: Chain, position: Array) -> Array:
-    """Return the origins of the base, joint and link frames along the arm.
+    """Return the origins of base, joint and link frames in the base frame [m], shape (postures, 1 + 2 joints, 3).
 
     Args:
         chain: the mechanism.
@@ -78,7 +78,7 @@ def joint_poses(chain: Chain, position: Array) -> list[tuple[Array, Array]]:
 
 
 def branches(chain: Chain) -> tuple[tuple[int, ...], ...]:
-    """Return per branch of the arm the points of `frame_origins` from the base to its end."""
+    """Return per branch of the arm the indices into `frame_origins`' points, from the base to the branch's end."""
     ends = set(range(chain.joints)) - set(chain.parents)
     return tuple(
         (0, *(point for k in chain.ancestors(end) for point in (1 + 2 * k, 2 + 2 * k))) for end in sorted(ends)
