@@ -304,7 +304,7 @@ class CanopenDriver(ExtendedSection):
         return max(self.watchdog_seconds(drive) for drive in self.drives)
 
     def watchdog_seconds(self, drive: CanopenDrive) -> float:
-        """Return how long a drive's watchdog waits for its signal until it trips [s]: its own time, or its kind's."""
+        """Return after how long without its signal a drive's watchdog trips [s]: its own setting, or its signal's."""
         times = {
             "rpdo_timer": self.torque_deadline,
             "heartbeat": self.heartbeats.waits,
@@ -342,7 +342,7 @@ class CanopenDriver(ExtendedSection):
 
     @property
     def status_frame(self) -> Literal["own", "position"]:
-        """Return `own` if the status word has a PDO of its own, `position` if it is sent with the position."""
+        """Return `own` if the status word has its own PDO, `position` if it is sent there: as described, or by EDS."""
         if self.status.frame is not None:
             return self.status.frame
         lacking = any(sheet.has(0x1800, 1) and not sheet.has(0x1801, 1) for sheet in self.sheets)
@@ -350,7 +350,7 @@ class CanopenDriver(ExtendedSection):
 
     @property
     def drives_a_frame(self) -> int:
-        """Return the largest number of drives that share one frame of targets: 1 or 4.
+        """Return the largest number of drives per frame of targets: 4, or 1 for 32-bit targets and `single` frames.
 
         Four torques of 16 bits share a frame. Two of 32 bits would fit, but no dummies do.
         """

@@ -141,7 +141,7 @@ def _count(data: bytes) -> int:
 
 
 def load_recording_format(path: str | Path) -> RecordingFormat:
-    """Read and check a YAML file that has the keys of an arm description's `recording` and nothing else.
+    """Return the checked content of a YAML file with the keys of an arm description's `recording` only.
 
     Raises:
         UsageError: no such file.
@@ -151,7 +151,7 @@ def load_recording_format(path: str | Path) -> RecordingFormat:
 
 
 def load_payload(path: str | Path) -> Payload:
-    """Read and check a YAML file that has the keys of an arm description's `payload` and nothing else.
+    """Return the checked content of a YAML file with the keys of an arm description's `payload` only.
 
     Raises:
         UsageError: no such file.

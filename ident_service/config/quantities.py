@@ -114,10 +114,10 @@ class TextFile(Section):
 
 
 def read_relative_file(value: Any, info: ValidationInfo) -> Any:
-    """Return name and text of the file that a `LocatedStr` names, relative to its YAML file; other values unchanged.
+    """Return name and text of the file that a `LocatedStr` names (bounded, UTF-8); other values unchanged.
 
-    Where the validation's context names that folder as `upload`, only files in it are read, and none is looked for
-    elsewhere: who sends a description learns nothing about other files.
+    Where the validation's context names the folder of the YAML file as `upload`, only files in it are read, and none is
+    looked for elsewhere: who sends a description learns nothing about other files.
     """
     return _read(value, info, lambda data: data.decode("utf-8"))
 

@@ -54,7 +54,7 @@ class Tree:
     places: dict[KeyPath, tuple[Path, int, int]] = field(default_factory=dict)
 
     def problem(self, path: KeyPath, message: str, fallback: Path) -> Problem:
-        """Return a Problem at the place of a key, or of its nearest ancestor that has one; else `fallback`, 1:1."""
+        """Return a Problem at a key's place, or its nearest ancestor's; at line 1 of `fallback` where none has one."""
         for length in range(len(path), -1, -1):
             if place := self.places.get(path[:length]):
                 return Problem(*place, message)

@@ -117,9 +117,9 @@ def counts(block: ExactBlock) -> list[int]:
 def prove(
     statement: Statement, multipliers: Sequence[Array], y: Array
 ) -> tuple[list[list[Fraction]], list[Fraction]] | None:
-    """Round multipliers to fractions that prove the statement exactly; return (per block, per row), None on failure.
+    """Round multipliers to fractions that prove infeasibility exactly; return those of blocks and rows, or None.
 
-    What is proven is that no body has the parameters: the multipliers' value is negative, or zero with one not zero.
+    With them no body has the parameters: the multipliers' value is negative, or zero with one not zero.
 
     Args:
         statement: statement that the multipliers prove.
@@ -127,7 +127,7 @@ def prove(
         y: multipliers of the statement's rows, shape (rows,).
 
     Returns:
-        Both in fractions, or None where rounding broke the proof.
+        Multipliers of each block and factors of the rows, in fractions; None where rounding broke the proof.
     """
     smallest = [_smallest(block, z) for block, z in zip(statement.blocks, multipliers, strict=True)]
     floor = min((value for value in smallest if value > 0.0), default=1e-12)
@@ -194,9 +194,6 @@ def repair(
         right: right-hand sides.
         values: approximate solution.
         weight: weight of an unknown; one with a larger weight is changed sooner.
-
-    Returns:
-        The values that solve the equations, or None where these contradict each other.
     """
     count: dict[Unknown, int] = {}
     for equation in equations:
@@ -361,7 +358,7 @@ _INTERIOR = 1e-9
 
 
 def dual_candidates(blocks: Sequence[Block], null: Array, delta: Array) -> Iterator[list[Array]]:
-    """Yield multipliers (one array per block) that prove infeasibility, most negative value first; may yield none.
+    """Yield approximate multipliers that prove infeasibility, most negative value first; none if none is found.
 
     Args:
         blocks: the conditions.

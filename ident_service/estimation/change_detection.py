@@ -298,7 +298,7 @@ def torque_shares(first: ComparedEstimate, second: ComparedEstimate, difference:
 
 
 def relevant(shares: tuple[Array, Array] | None) -> bool:
-    """Return whether some joint's torque changes by 1 % of its torque and 25 % of its residual; True for None."""
+    """Return whether a joint's torque changes by at least 1 % of its torque, 25 % of its residual; True for None."""
     if shares is None:
         return True
     return bool(np.any((shares[0] >= RELEVANT_TORQUE) & (shares[1] >= RELEVANT_RESIDUAL)))
@@ -458,7 +458,7 @@ def meaning_of_effect(effect: Effect, found: ParameterChange, leading: Sequence[
 def friction_ratio(first: ComparedEstimate, second: ComparedEstimate, joint: int) -> tuple[float, float] | None:
     """Return (friction of the second over the first, speed [rad/s or m/s] it is taken at); None where unknown.
 
-    The speed is the root mean square of the motion's; unknown without a motion, or without such friction in the first.
+    The speed is the root mean square of the motion's.
 
     Args:
         first: the reference.

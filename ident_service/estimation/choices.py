@@ -56,7 +56,7 @@ def best_choice(option: str, held_out: Mapping[str, float]) -> Choice:
 
 
 def significant_choice(option: str, held_out: Mapping[str, Array]) -> Choice:
-    """Choose the first alternative, unless another predicts every third better, by more than the thirds differ.
+    """Choose the first alternative, unless another predicts every third clearly better; then the smallest error.
 
     Args:
         option: key in the configuration's section `identification`.

@@ -54,9 +54,6 @@ class CustomFunction:
             link: link parameters in SI units by their names (`m7`).
             base: base parameters in SI units by their expressions, as `ident base-parameters` prints them.
 
-        Returns:
-            Convex constraints, and the penalty or None.
-
         Raises:
             CustomError: the function raises, or returns something else or something that is not convex.
         """

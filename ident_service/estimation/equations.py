@@ -317,10 +317,9 @@ def _block_seconds(recording: Recording, model: ArmModel) -> float:
 
 
 def equation_rows(recording: Recording, model: ArmModel, base: BaseParameters, *, once: bool = False) -> Iterator[Rows]:
-    """Yield regressor and torque rows of a recording in chunks; motor factors and a known payload are taken out.
+    """Yield regressor and torque rows in chunks; recorded torque times motor factors, less a known payload's.
 
-    Recorded torques are multiplied by the factors of the motors that the description states, and lack what a known
-    payload needs. Rows stay in the recording's memory unless they are asked for `once`.
+    The description states the motors' factors. Rows stay in the recording's memory unless they are asked for `once`.
 
     Raises:
         RecordingError: the recording does not fit the arm or cannot be smoothed.
@@ -351,10 +350,7 @@ def _of_links(rows: Rows, recording: Recording, model: ArmModel, base: BaseParam
 
 
 def motors_of_torques(model: ArmModel) -> Array:
-    """Return the matrix from recorded joint torques to motor torques, (motors, joints); identity without gears.
-
-    Without gears in the description, motors are the joints.
-    """
+    """Return the matrix from recorded joint torques to motor torques, (motors, joints); identity without gears."""
     gears = model.config.transmission
     if gears is None:
         return np.eye(model.chain.joints)

@@ -486,9 +486,6 @@ def fit_friction(
         model: the arm; `identification.friction` says what to fit.
         base: grouping of its parameters, which these numbers do not change.
         conditions: feasible set of the estimates that judge choices; nothing is chosen when None.
-
-    Returns:
-        The arm with its numbers, and for each kind whether it was fitted or left out.
     """
     shape = model.config.identification.friction
     wanted = fitted_friction_parameters(model)

@@ -182,7 +182,7 @@ class Estimate:
 
     @property
     def feasible(self) -> bool:
-        """Return whether the margin in the estimate's feasible set is positive."""
+        """Return whether a real body could have these parameters: the margin in the feasible set is positive."""
         return self.margin > 0.0
 
 

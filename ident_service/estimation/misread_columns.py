@@ -99,7 +99,7 @@ class Reading:
         return self.which == "torque" and self.negates
 
     def read(self, columns: Array, what: Literal["torque", "position"]) -> Array:
-        """Return samples, shape (samples, joints), exchanged or scaled as this reading does; unchanged if of others.
+        """Return samples, (samples, joints), exchanged or scaled by this reading; unchanged if it is not about `what`.
 
         `which` says whether the reading is about torques, positions (with velocities) or both. Time and zero are not
         applied.

@@ -401,7 +401,7 @@ def body_words(payload: Payload) -> tuple[str, ...]:
 
 
 def center_of_mass(payload: Payload) -> tuple[Array, Array] | None:
-    """Return the centre of mass in the last link's frame and its standard deviations [m], each of shape (3,).
+    """Return centre of mass in the last link's frame and its deviations [m], (3,) each; None where not determined.
 
     Unconstrained, so that the deviations belong to it; None where mass or a first moment is not shown on its own.
     """

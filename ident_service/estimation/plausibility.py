@@ -71,7 +71,7 @@ class Objections:
 
     @property
     def motion_mends(self) -> bool:
-        """Return whether a longer motion would do: there are reasons of `little_motion`, and none of `wrong`."""
+        """Return whether another motion is all that is needed: reasons of `little_motion`, and none of `wrong`."""
         return bool(self.little_motion) and not self.wrong
 
 

@@ -52,12 +52,10 @@ def huber(
     shares: Array | None = None,
     spread: SpreadRows | None = None,
 ) -> tuple[LeastSquares, Equations, float]:
-    """Return Huber's estimate, the reweighted equations that it solves, and how much the last round changed it.
+    """Return Huber's estimate, the reweighted equations that it solves, and how much its last round changed it.
 
-    The change is in standard deviations.
-
-    Where the weights do not settle in the rounds that there are, the one that changed least is the answer: a change
-    above `SETTLED` says so.
+    The change is in standard deviations. Where the weights do not settle in the rounds that there are, the one that
+    changed least is the answer: a change above `SETTLED` says so.
 
     Args:
         recordings: to fit to; each is read twice.
@@ -122,7 +120,7 @@ class SpreadRows:
     tables: tuple[Array, ...]
 
     def huber(self, beta: Array, rounds: int) -> tuple[Array, float]:
-        """Reweight for up to `rounds` rounds; return the estimate that changed least, and that change in deviations."""
+        """Reweight for up to `rounds` rounds; return the estimate that changed least, and its change in deviations."""
         best = (beta, np.inf)
         for _ in range(rounds):
             better, deviations = self._reweighted(beta).estimate()
@@ -183,7 +181,7 @@ class SpreadRows:
 def spread_rows(
     recordings: Sequence[Recording], model: ArmModel, base: BaseParameters, times: Array, shares: Array
 ) -> SpreadRows:
-    """Read every recording once and return its rows; of long ones only every 2nd, 4th ... sample.
+    """Read every recording once; return its rows, torques times `times`; of long ones every 2nd, 4th ... sample.
 
     Raises:
         RecordingError: a recording cannot be used.

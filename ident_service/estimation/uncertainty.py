@@ -144,7 +144,7 @@ def _inflation(seen: Sequence[_Whitened], variance: float) -> float:
 def jackknife(
     clusters: Sequence[Sequence[Information]], fit: LeastSquares, along: Array | None = None
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return covariance, degrees of freedom and a mask of unseen combinations, leaving out one cluster at a time.
+    """Return covariance, degrees of freedom and a mask of the unseen, leaving out one cluster at a time (HC3).
 
     Args:
         clusters: clusters of blocks; each cluster counts as one piece of evidence.
@@ -284,7 +284,7 @@ def block_covariance(equations: Equations, fit: LeastSquares) -> Array:
 
 
 def negligible(information: Information) -> Array:
-    """Return the size [SI] below which each parameter makes under a tenth of any joint's torque, shape (base,).
+    """Return the size [SI] below which each parameter makes under a tenth of every joint's torque, shape (base,).
 
     A parameter of this size makes a tenth of the torque of some joint that feels it, and no more of any other's. So a
     deviation of a tenth of it, with which it is called identified, is a hundredth of the joint's torque.

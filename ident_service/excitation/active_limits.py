@@ -159,7 +159,7 @@ def stiffer_gains(
     limits: MotionLimits,
     stable: Callable[[Array, Array], bool],
 ) -> dict[int, str]:
-    """Return sentences, by joint index, that propose stiffer kp and kd where following holds back; jointly stable.
+    """Return sentences, by joint index, on stiffer kp and kd where following holds back, stable all together.
 
     Args:
         found: the limits.

@@ -20,7 +20,7 @@ _HELD = 0.7  # of the torque limits, that a motion about home takes at most
 def excitation(
     model: ArmModel, purpose: Literal["identification", "validation"], *, checked: bool = True
 ) -> Excitation:
-    """Build the motion that the description configures for a purpose; `checked`: raise if it leaves a limit.
+    """Return the motion configured for a purpose, proven to keep the arm's limits if `checked`.
 
     Raises:
         MotionRefused: limits are missing, or the motion leaves them.

@@ -226,7 +226,7 @@ class Prover:
         return best
 
     def aimed(self, candidate: Candidate) -> Task:
-        """Return the task made harder by what the candidate's proof lacks at full size; unchanged if it is proven."""
+        """Return the task made harder by what the candidate's proof lacks at full size; else the task itself."""
         first = self._at_full_size(self._task, candidate)
         return (self._harder(first) if first.why else None) or self._task
 
@@ -437,7 +437,7 @@ def design_motion(
     tell: Callable[[Progress], None] = lambda _: None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> Designed:
-    """Search for the most informative motion within a budget, and return it with a proof of all limits.
+    """Return the most informative motion that a search within a budget finds, proven to keep every limit.
 
     Args:
         model: of the arm, with prior parameters.

@@ -516,7 +516,7 @@ def scale_to_verified(
     safe: Array,
     proven: Callable[[Array], Proof | None],
 ) -> tuple[Array, Proof] | None:
-    """Return coefficients and proof of the largest shrunken motion that is proven; None if even 1 % is not.
+    """Return a motion's coefficients and proof if proven, else of a smaller one; None if even 1 % of it is not.
 
     Sizes are tried ever more coarsely until one can be proven, then halfway back. That takes a few proofs, of seconds
     each, where one size after another would take twenty.
@@ -526,9 +526,6 @@ def scale_to_verified(
         coefficients: of the motion, shape (joints, size).
         safe: coefficients of standing still in a posture that keeps all limits.
         proven: the proof of a motion that keeps all limits, None for one that does not.
-
-    Returns:
-        Coefficients and proof, or None where even a hundredth of the motion cannot be proven.
     """
     if (proof := proven(coefficients)) is not None:
         return coefficients, proof

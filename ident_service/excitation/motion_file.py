@@ -71,7 +71,7 @@ class Excitation:
 
 
 def read_excitation(file: FilePath) -> Excitation:
-    """Read a motion's JSON file.
+    """Read a motion from its JSON file; raises UsageError where the file is missing or holds none.
 
     Raises:
         UsageError: no such file, or not a motion; the message says what is wrong with it.

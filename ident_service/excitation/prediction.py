@@ -78,7 +78,7 @@ class InertiaResponse:
         return self._response
 
     def pull(self, seeds: Array) -> tuple[Array, Array]:
-        """Return the gradient of `sum(seeds * run(...))` at the last run's states.
+        """Return the gradient of `sum(seeds * run(...))` over position and torque, each of shape (samples, joints).
 
         Args:
             seeds: shape (samples, joints).
@@ -144,7 +144,7 @@ def information(path: FourierPath | PosturePath, model: ArmModel, base: BasePara
 
 
 def seconds_of_information(path: FourierPath | PosturePath) -> float:
-    """Return how long the motion informs [s]: its whole periods, or all of a motion through postures."""
+    """Return the time that `information` counts for [s]: all periods, or the whole motion through postures."""
     return path.periods * path.series.period if isinstance(path, FourierPath) else path.duration
 
 

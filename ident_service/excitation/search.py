@@ -103,9 +103,6 @@ def local_search(
         check: called at every evaluation; what it raises ends the rounds.
         polish: True for a motion that is good already.
 
-    Returns:
-        The best motion found.
-
     Raises:
         InterruptedWithResult: `check` raised Interrupted; with the best of what the rounds had found until then.
     """

@@ -75,11 +75,11 @@ class Tracking:
     repeats_from: float = np.inf
 
     def late(self, limits: MotionLimits) -> NDArray[np.bool_]:
-        """Return a mask of joints whose simulated following error is more than a share of its limit allows."""
+        """Return a mask of joints whose simulated following error exceeds 85 % of its limit, shape (joints,)."""
         return np.asarray(~(self.used(limits)[0] <= 1.0))
 
     def used(self, limits: MotionLimits) -> tuple[Array, Array]:
-        """Return following error and velocity as shares of what a simulated arm may use, shape (joints,) each."""
+        """Return following error over 85 % of its limit, and velocity over 110 % of its limit, shape (joints,) each."""
         return self.error / (_ERROR_USED * limits.following_error), self.velocity / (_VELOCITY_USED * limits.velocity)
 
     def objections(self, names: Sequence[str], limits: MotionLimits) -> list[str]:
@@ -187,7 +187,7 @@ def segment_tube_width(path: Path, model: ArmModel, margin: float) -> Callable[[
         margin: margin, as for `track`.
 
     Returns:
-        How far the arm may be from its reference, as `Tracking.width`.
+        A function of times and half widths [s], as `Tracking.width`.
 
     Raises:
         ModelError, MotionRefused: as `track`.

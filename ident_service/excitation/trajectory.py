@@ -196,7 +196,7 @@ class FourierPath(_Sampled):
         return np.array(sorted(set(ends)))
 
     def fastest(self, begin: float, end: float) -> float:
-        """Return the frequency of the highest harmonic, or the reciprocal of the ramp where that is higher [Hz]."""
+        """Return the highest harmonic's frequency [Hz]; in a ramp, the reciprocal ramp time where that is higher."""
         highest = self.series.base_frequency * self.series.a.shape[1]
         in_ramp = self.ramp > 0.0 and (begin < self.ramp or end > self.duration - self.ramp)
         return float(max(highest, 1.0 / self.ramp) if in_ramp else highest)
@@ -282,7 +282,7 @@ class PosturePath(_Sampled):
         return np.unique(np.concatenate([[0.0], self._begins[:-1], self._begins[:-1] + self.times, [self.duration]]))
 
     def fastest(self, begin: float, end: float) -> float:
-        """Return the reciprocal duration of the shortest segment [Hz]."""
+        """Return the reciprocal duration of the shortest of all segments [Hz], whatever the two times are."""
         return float(1.0 / self.times.min())
 
     def derivatives(self, time: Array, highest: int) -> list[Array]:

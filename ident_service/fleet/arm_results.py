@@ -239,7 +239,7 @@ def errors_held_out(
         described: the arm.
 
     Returns:
-        The two of `trained` and the two of `single`.
+        Alone and pooled of `trained`, then of `single`.
     """
     held, prior = fits.held, common.other_arms(arm)
     assert held is not None  # noqa: S101 - as said above

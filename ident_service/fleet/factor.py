@@ -617,9 +617,6 @@ def merge_stored(keys: Sequence[str], described: Described, store: Store, whole:
         described: the arm.
         store: store of the factors.
         whole: whether a recording is one cluster, for arms with enough of them.
-
-    Returns:
-        Their information; or the keys of those that are not there, or are damaged.
     """
     level = [_merge_leaf(keys[k : k + FAN_IN], described, store, whole) for k in range(0, len(keys), FAN_IN)]
     while len(level) > 1:
@@ -647,9 +644,6 @@ def merge(parts: Sequence[Merged | tuple[str, ...]]) -> Merged | tuple[str, ...]
     """Merge the information of recordings in the order given; or return the missing keys that parts stand for.
 
     Neighbours' clusters become one where there are many.
-
-    Returns:
-        Their information; or the keys of all factors that some of the parts lack.
     """
     if missing := tuple(key for part in parts if not isinstance(part, Merged) for key in part):
         return missing

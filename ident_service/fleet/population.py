@@ -526,7 +526,7 @@ class Shares:
 
     @property
     def percent(self) -> Array:
-        """Return each parameter's variance split over arms, recordings and noise [percent], shape (base, 3)."""
+        """Return each parameter's variance due to arms, recordings and noise [percent], (base, 3); zero if unseen."""
         parts = np.column_stack([self.arms, self.recordings, self.noise])
         total = parts.sum(axis=1, keepdims=True)
         return np.asarray(100.0 * parts / np.where(total > 0.0, total, 1.0))

@@ -133,7 +133,7 @@ class BaseParameters:
 
     @cached_property
     def expressions(self) -> tuple[str, ...]:
-        """Return each base parameter as a sum of link parameters (table 3)."""
+        """Return each base parameter as text, a sum of link parameters with coefficients (table 3)."""
         return tuple(
             format_expression([(float(row[column]), self.names[column]) for column in np.flatnonzero(row)])
             for row in self.K

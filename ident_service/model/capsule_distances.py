@@ -48,6 +48,8 @@ def between_segments(
 ) -> tuple[Array, Array, Array, Array]:
     """Return distances [m], directions and nearest points of pairs of segments, also parallel or degenerate.
 
+    After Ericson, Real-Time Collision Detection, 5.1.9.
+
     Args:
         start: starting points of the first segments [m], shape (3, pairs, samples).
         along: vectors from start to end of the first segments [m], shape (3, pairs, samples).
@@ -227,9 +229,6 @@ class CapsuleModel:
         Args:
             position: [rad or m], shape (samples, joints).
 
-        Returns:
-            Signed distances [m], negative where the pair overlaps, shape (pairs, samples).
-
         Raises:
             ModelError: positions of another shape.
         """
@@ -248,7 +247,7 @@ class CapsuleModel:
         return self._smallest.copy()
 
     def pull(self, seeds: Array) -> Array:
-        """Return the gradient of `sum(seeds * distances)` at the positions of the last call of `distances`.
+        """Return the gradient of `sum(seeds * distances)` at the last positions, shape (samples, joints).
 
         Args:
             seeds: shape (pairs, samples).

@@ -102,7 +102,7 @@ def _clean(value: float) -> float:
 
 
 def chain_from_dh(table: DHTable, gravity: tuple[float, float, float]) -> Chain:
-    """Return the serial chain of a DH table.
+    """Return the serial chain of a standard or modified DH table, with this gravity [m/s^2].
 
     Standard: `A_k = Rz(theta) Tz(d) Tx(a) Rx(alpha)`, link frames distal as in the paper (table 2). Modified (Craig):
     `A_k = Rx(alpha) Tx(a) Rz(theta) Tz(d)`, link frames on the joint's own axis. The joint variable adds to theta, or

@@ -303,9 +303,6 @@ class CollisionModel:
         Args:
             position: [rad or m], shape (samples, joints).
 
-        Returns:
-            Signed distances [m], negative where the pair overlaps, shape (samples, pairs).
-
         Raises:
             ModelError: positions of another shape.
         """

@@ -88,9 +88,6 @@ class DynamicModel:
             velocity: [rad/s or m/s], shape (..., joints).
             direction: direction of dry friction per drive, from `turned`, shape (..., joints); when None, the sign of
                 the drive's velocity: none at rest, and no pre-sliding.
-
-        Returns:
-            [N m or N], shape (..., joints).
         """
         coupling, layout = self.arm.chain.coupling, self.arm.layout
         rate = np.asarray(velocity, dtype=float) @ coupling.T

@@ -23,8 +23,6 @@ from ident_service.model.chain import Array
 def presliding_distances(model: ArmModel) -> Array:
     """Return the pre-sliding distance x0 per drive [rad or m], shape (joints,); zero where none applies.
 
-    That is where dry friction turns round at once: nothing was fitted, or the arm has no dry friction.
-
     Zero where dry friction turns round at once: nothing was fitted, or the arm has no dry friction.
     """
     given = model.config.identification.friction.presliding
@@ -57,9 +55,6 @@ def friction_direction(rate: Array, period: float, presliding: Array, start: Arr
         period: of the samples [s].
         presliding: x0 per drive [rad or m], shape (drives,); 0 for the sign itself.
         start: direction before the first sample, shape (drives,); the first sign that follows when None.
-
-    Returns:
-        Shape (samples, drives).
     """
     result = np.empty_like(rate)
     for drive, x0 in enumerate(presliding):

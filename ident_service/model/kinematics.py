@@ -25,7 +25,7 @@ def frame_origins(chain: Chain, position: Array) -> Array:
 
 
 def joint_frames(chain: Chain, position: Array) -> tuple[Array, Array]:
-    """Return orientation and origin of every joint frame in the base frame, where its link's solids stand still.
+    """Return rotation and origin [m] of every joint frame in the base frame; its link's solids do not move in it.
 
     Args:
         chain: the mechanism.
@@ -40,7 +40,7 @@ def joint_frames(chain: Chain, position: Array) -> tuple[Array, Array]:
 
 
 def link_poses(chain: Chain, position: Array) -> tuple[Array, Array]:
-    """Return orientation and origin of every link frame in the base frame.
+    """Return rotation and origin [m] of every link frame in the base frame, at each posture.
 
     Args:
         chain: the mechanism.

@@ -173,7 +173,7 @@ def _is_body(parameters: Array) -> bool:
 
 
 def perturbed_body(parameters: Array, rng: np.random.Generator) -> Array:
-    """Return a random real body near another one, shape (10,): A P A^T, A near identity, mass unchanged.
+    """Return a random real body near another one, shape (10,): A P A^T, A near identity, mass within about 10 %.
 
     Args:
         parameters: of a real body, shape (10,), see `INERTIAL`.

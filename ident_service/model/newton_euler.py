@@ -90,7 +90,7 @@ def rigid_torque(
     q: Sequence[Symbol],
     *rates: Sequence[Value],
 ) -> list[Value]:
-    """Record the joint torques of the links: M(q) ddq + c(q, dq) + g(q); only gravity's without rates.
+    """Return the links' joint torques as symbolic values: M(q) ddq + c(q, dq) + g(q); without rates only g(q).
 
     Args:
         tape: graph that the formulas are recorded in.

@@ -298,7 +298,7 @@ def _table(
 
 
 def urdf_outline(text: str, folder: Path) -> Outline:
-    """Read tree, limits and capsules around meshes from a URDF that has passed `require_parser_limits`.
+    """Read tree, limits and collision capsules from a URDF that has passed `require_parser_limits`.
 
     Args:
         text: of the file.
@@ -639,7 +639,7 @@ def arm_part(outline: Outline, file: str, base: str | None, tip: str | None) -> 
 
 
 def mjcf_outline(path: Path) -> Outline:
-    """Read tree, limits and capsules around meshes from an MJCF, in a process with limits.
+    """Read tree, limits and collision capsules from an MJCF, in a process with limits.
 
     Raises:
         ModelError: it cannot be read.

@@ -205,7 +205,7 @@ class JointDrives:
 
 
 def own_drives(chain: Chain) -> NDArray[np.bool_]:
-    """Return a mask of joints that one drive moves which moves no other joint, shape (joints,)."""
+    """Return a mask of the joints moved by one drive alone that moves no other joint, shape (joints,)."""
     shared = (chain.coupling != 0.0) & ~np.eye(chain.joints, dtype=bool)
     return np.asarray(~(shared.any(axis=0) | shared.any(axis=1)))
 

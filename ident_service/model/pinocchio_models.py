@@ -93,7 +93,7 @@ def pinocchio_model(chain: Chain, layout: Layout, delta: Array) -> pin.Model:
     pinocchio's has no sticking.
 
     Raises:
-        ModelError: `delta` does not fit the layout, or a link has no positive mass.
+        ModelError: `delta` does not fit the layout, a link has no positive mass, or a drive moves several joints.
     """
     if delta.shape != (layout.size,):
         raise ModelError(f"{delta.shape=} but the layout has {layout.size} parameters")

@@ -60,9 +60,6 @@ def joint_regressor(
         direction: direction of Coulomb friction per drive, from -1 to 1, shape (samples, joints); the sign of the
             drive's velocity when None.
 
-    Returns:
-        H, shape (joints, columns, samples): joint i's equations are `H[i].T @ delta`.
-
     Raises:
         ModelError: the arrays have the wrong shape.
     """

@@ -245,7 +245,7 @@ class Differentiable:
         return self._values[: self._outputs]
 
     def pull(self, seeds: Array) -> Array:
-        """Return the gradient of `sum(seeds * outputs)`, sample by sample, at the values of the last run.
+        """Return the gradient of `sum(seeds * outputs)` over the inputs at the last run, shape (inputs, samples).
 
         Args:
             seeds: shape (outputs, samples).

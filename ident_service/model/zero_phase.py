@@ -91,7 +91,7 @@ def _one_way(columns: Array, sections: list[tuple[float, float, float]]) -> Arra
 
 
 def local_polynomial(values: Array, length: int, degree: int, derivative: int, period: float) -> Array:
-    """Return the derivative, in the middle of a moving window, of a polynomial fitted to it (Savitzky-Golay).
+    """Return the `derivative` (0: the value) of polynomials fitted to a window around each sample (Savitzky-Golay).
 
     The first and last half window belong to the polynomials of the first and last whole window.
 

@@ -110,9 +110,6 @@ def records(stream: IO[bytes], size: int, wanted: Collection[int]) -> Iterator[t
         size: how many of its bytes to read at most.
         wanted: opcodes to read; the others are stepped over.
 
-    Yields:
-        Opcode and content of each wanted record.
-
     Raises:
         TornError: the bytes end before the closing magic, or cannot be records.
         TooLargeError: a wanted record above 64 MiB.
@@ -189,11 +186,7 @@ def expand(content: bytes) -> bytes:
 
 
 def messages(run: bytes, directory: Directory, choose: Callable[[int], bool] = lambda _: True) -> Iterator[Message]:
-    """Yield channel id, log time [ns] and payload of each message in bytes of records, one by one.
-
-    Yields:
-        Channel id, log time [ns], payload.
-    """
+    """Yield channel id, log time [ns] and payload of each message in bytes of records, one by one."""
     for found in series(run, directory, choose):
         if isinstance(found, Series):
             for stamp, row in zip(found.log_times.tolist(), found.payloads, strict=True):

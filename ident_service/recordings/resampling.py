@@ -329,7 +329,7 @@ def uniform(
     shortest_s: float = 0.0,
     samples: int = BLOCK_SAMPLES,
 ) -> Iterator[UniformRun]:
-    """Yield a recording as uniformly spaced samples, segment after segment; resampled only if irregular.
+    """Yield a recording as uniformly spaced samples, segment by segment; unchanged where regular already.
 
     A regular recording passes through bit for bit, cut at its gaps; so do the values of one whose stamps are of
     arrival, which get even stamps from each segment's first one on. Any other is resampled at `first + k period` in all

@@ -52,7 +52,7 @@ class SinkEnds:
     room: int
 
     def close(self) -> None:
-        """Close all descriptors, here only."""
+        """Close all descriptors in this process."""
         for fd in astuple(self):
             os.close(fd)
 
@@ -110,11 +110,9 @@ class RingSink:
         return self._gone
 
     def put(self, cycle: Cycle) -> bool:
-        """Put one cycle into the ring; return whether the recorder keeps up; in lock step wait for it, True.
+        """Put one cycle into the ring; return whether the recorder keeps up, or in lock step wait until it does.
 
         The cycle's arrays are copied. Out of lock step this never waits.
-
-        In lock step this may wait for the recorder; otherwise it never does.
 
         Returns:
             Whether the recording keeps up; in lock step always True.

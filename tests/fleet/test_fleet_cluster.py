@@ -23,7 +23,7 @@ from ident_service.certificate_verifier import verify_path
 from ident_service.cli import main
 from ident_service.errors import Unavailable
 from ident_service.fleet.identify import identify_fleet
-from ident_service.fleet.reduction import FleetRequest, results_as_completed, result_of
+from ident_service.fleet.reduction import FleetRequest, result_of, results_as_completed
 
 # These load for two seconds where they are used, and not where tests are only collected.
 if TYPE_CHECKING:

@@ -259,7 +259,7 @@ class ConicProblem:
     def minimise(
         self, objective: Array, name: str, quadratic: Array | None = None, enough: float | None = None
     ) -> Solution:
-        """Minimise an objective over the constraints added so far; raises SolverError unless an optimum is reached.
+        """Return the x that minimises an objective over the constraints added so far; raises SolverError.
 
         Args:
             objective: linear coefficients, shape (variables,).

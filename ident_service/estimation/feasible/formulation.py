@@ -93,7 +93,7 @@ def minimise(
     reaches: Sequence[float] = OF_TESTS,
     enough: float | None = None,
 ) -> Solution:
-    """Solve within the first bound on the links' tr(P) (a reach) that has an acceptable optimum.
+    """Minimise an objective; return the first acceptable optimum among bounds (reaches) on the links' tr(P).
 
     Args:
         problem: problem with all its constraints.

@@ -69,7 +69,7 @@ class FeasibleEstimate:
         likely: LikelyBodies | None = None,
         near: ChangeEllipsoid | None = None,
     ) -> FeasibleEstimate:
-        """Return the estimate with its link parameters centred near likely ones; base parameters move within `near`."""
+        """Return the estimate with link parameters centred near likely ones; base parameters may move within `near`."""
         delta = centre(self.delta, base, conditions, likely, near)
         beta = self.beta if near is None else base.K @ delta
         return replace(self, beta=beta, delta=delta, margin=conditions.margin(delta)[0])

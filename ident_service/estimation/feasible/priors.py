@@ -101,7 +101,7 @@ class Prior:
         return tuple(blocks)
 
     def divergence(self, delta: Array) -> float:
-        """Return the distance of delta from the prior; `entropic`: infinite outside positive pseudo-inertias."""
+        """Return the divergence of delta from the prior; infinite outside positive pseudo-inertias if `entropic`."""
         columns = self.euclidean
         total = float(np.sum(((delta - self.delta)[columns] / self.scales[columns]) ** 2))
         if self.kind == "entropic":
