@@ -180,7 +180,7 @@ class Prover:
         self._limits, self._collision = motion_limits(model.config), CollisionModel(model)
 
     def proof(self, coefficients: Array) -> tuple[Proof, str]:
-        """Return the proof of a motion's bounds, and the limits it does not keep in words; "" where it keeps all."""
+        """Return the proof of a motion's bounds, and what speaks against the motion in words; "" where nothing does."""
         path, limits = self._task.basis.path(coefficients), self._task.limits
         proof = proof_of(path, self._model, limits, self._collision, self._margin)
         why = "; ".join(violations(proof, self._model, limits))

@@ -141,7 +141,7 @@ def records(stream: IO[bytes], size: int, wanted: Collection[int]) -> Iterator[t
 
 
 def contents(stream: IO[bytes], size: int) -> Iterator[bytes]:
-    """Yield each chunk of a file, expanded and checked, as bytes of records; records outside chunks alone.
+    """Yield each chunk of a file, expanded and checked, as bytes of records; records outside chunks singly.
 
     Raises:
         TornError: as `records`, or a chunk that is damaged.
