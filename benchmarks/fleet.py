@@ -39,7 +39,7 @@ from ident_service.fleet.factor import (
     reduce_recording,
 )
 from ident_service.fleet.identify import identify_fleet
-from ident_service.fleet.reduction import FleetRequest, connected, in_order
+from ident_service.fleet.reduction import FleetRequest, connected, results_as_completed
 from ident_service.fleet.storage import Store, find
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -185,7 +185,9 @@ def _nothing(number: int) -> int:
 def overhead(client: Client) -> float:
     """Return seconds a task that does nothing takes, of 10,000."""
     begin = time.perf_counter()
-    done = sum(1 for _ in in_order(client, _nothing, [(number,) for number in range(TASKS)], lambda number: number))
+    done = sum(
+        1 for _ in results_as_completed(client, _nothing, [(number,) for number in range(TASKS)], lambda number: number)
+    )
     if done != TASKS:
         raise ValueError(done)
     return (time.perf_counter() - begin) / TASKS

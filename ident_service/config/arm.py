@@ -108,12 +108,12 @@ else:
 
 
 def is_canopen(driver: Driver | None) -> TypeGuard[CanopenDriver]:
-    """Return whether drives are CANopen's, without loading their model for others."""
+    """Return whether the driver's `kind` is `canopen`; False for None. Loads no CANopen module."""
     return driver is not None and driver.kind == "canopen"
 
 
 def is_barrett(driver: Driver | None) -> TypeGuard[BarrettDriver]:
-    """Return whether drives are Barrett's pucks, likewise."""
+    """Return whether the driver's `kind` is `barrett` (pucks of a WAM); False for None."""
     return driver is not None and driver.kind == "barrett"
 
 
@@ -535,14 +535,14 @@ class ArmConfig(ExtendedSection):
 
     @property
     def can_buses(self) -> tuple[CanBus, ...]:
-        """Return the CAN buses of the arm's drives, in the order of their numbers; none where they are on none."""
+        """Return the CAN buses of CANopen or Barrett drives, in the order of their numbers; empty for others."""
         if is_canopen(self.driver):
             return self.driver.buses
         return (self.driver.bus,) if is_barrett(self.driver) else ()
 
     @property
     def motor_torques(self) -> tuple[float, ...] | None:
-        """Return what the motors give at most [N m], in the order of the transmission; None where unknown."""
+        """Return the largest torque of each motor [N m], in the order of the transmission; None without CAN drives."""
         if is_canopen(self.driver):
             return tuple(drive.max_torque * drive.torque_scale for drive in self.driver.drives)
         if is_barrett(self.driver):
@@ -556,7 +556,7 @@ class ArmConfig(ExtendedSection):
 
     @property
     def watchdog(self) -> float | None:
-        """Return after how long without its host the slowest drive gives up torque [s]; None where unknown.
+        """Return how long the slowest drive keeps torque without its host [s]; None without driver or for a plugin.
 
         What an open arm reports of itself counts more (`ArmDescription.watchdog`); this is for before it is opened.
         """
@@ -564,41 +564,41 @@ class ArmConfig(ExtendedSection):
 
     @property
     def watchdog_reason(self) -> str:
-        """Return why drives of an arm that can fall may go on for longer than usual; empty for no reason."""
+        """Return the stated reason why drives may keep torque without host unusually long; empty where none is."""
         return "" if self.driver is None or isinstance(self.driver, PluginDriver) else self.driver.watchdog_reason
 
     @property
     def delay_cycles(self) -> int:
-        """Return the cycles from a sample to the torque that is computed from it; 1 is the Arm contract's."""
+        """Return the cycles from a sample to its torque's effect: the simulated driver's setting, 1 for all others."""
         return self.driver.delay_cycles if isinstance(self.driver, SimulatedDriver) else 1
 
     @property
     def zeroed_at_home(self) -> bool:
-        """Return whether a person zeroes the arm at its home, since encoders count from where power came."""
+        """Return whether encoders count from power-on, so a person zeroes at home: Barrett, or `zero: at_home`."""
         at_home = is_canopen(self.driver) and self.driver.zero == "at_home"
         return at_home or is_barrett(self.driver)
 
     @property
     def idle_drives_hold(self) -> bool:
-        """Return whether drives that were stopped go on holding the arm, as CANopen's in quick stop do.
+        """Return whether drives go on holding the arm after a stop: True for CANopen drives (quick stop), else False.
 
         Idle pucks brake by their windings, so that an arm sinks; there is nothing to let go of.
         """
         return is_canopen(self.driver)
 
     def has_brake(self, joint: str) -> bool:
-        """Return whether a holding brake holds the joint when its drive has no power."""
+        """Return the joint's `brake` (holding without power) as described; if unsaid, True for a simulated arm only."""
         said = self.joints[joint].brake if joint in self.joints else None
         return said if said is not None else self.driver is not None and self.driver.kind == "simulated"
 
     @property
     def sha256(self) -> str:
-        """Return the SHA-256 of the whole resolved description, files it names included."""
+        """Return the SHA-256 (hex) of the whole resolved description, files it names included."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
 
     @property
     def motion_sha256(self) -> str:
-        """Return the SHA-256 of all that the safety of a motion depends on: mechanism, limits, model, surroundings.
+        """Return the SHA-256 of the keys a motion's safety depends on: mechanism, limits, model, surroundings.
 
         Other estimators, recording formats, motions or drivers leave it as it is.
         """

@@ -61,17 +61,17 @@ class Puck(Section):
 
     @property
     def max_torque(self) -> float:
-        """Return the largest torque that the puck lets through, at the motor [N m]."""
+        """Return the largest torque that the puck's setting MT lets through, at the motor [N m]."""
         return self.mt / self.ipnm
 
     @property
     def group(self) -> int:
-        """Return the group whose torque frame has this puck's torque: 1 lower arm, 2 wrist."""
+        """Return the number of the group torque frame that carries this puck's torque: 1 lower arm, 2 wrist."""
         return 1 if self.node in LOWER else 2
 
     @property
     def slot(self) -> int:
-        """Return the place in that frame, from 1 (property PIDX)."""
+        """Return the puck's place in its group's torque frame, 1 to 4 (property PIDX)."""
         return (self.node - 1) % 4 + 1
 
 
@@ -157,7 +157,7 @@ class BarrettDriver(Section):
 
     @property
     def report_delay(self) -> float:
-        """Return the largest delay with which a change of status is seen [s]."""
+        """Return the longest time until a puck's change of status is seen [s]: two periods of the status."""
         return 2.0 * self.status_period
 
     @model_validator(mode="after")
@@ -190,7 +190,7 @@ def disagreements(
     rate: float,
     homeless: Sequence[str] = (),
 ) -> Iterator[tuple[tuple[str | int, ...], str]]:
-    """Yield what is inconsistent with an arm of these joints: the place in the file, and the mistake.
+    """Yield (key path, message) for each contradiction of section `driver` with joints, homes, gears or rate.
 
     Args:
         driver: the section `driver`.

@@ -29,7 +29,7 @@ class CanBus(Section):
 
     @property
     def medium(self) -> str:
-        """Return the namespace of `channel`: `kernel` for CAN interfaces of the kernel, else the interface."""
+        """Return the namespace of `channel`: `kernel` for interfaces `raw` and `socketcan`, else the interface."""
         return "kernel" if self.interface in _KERNELS else self.interface
 
     @model_validator(mode="after")

@@ -78,7 +78,7 @@ class Heartbeats(ExtendedSection):
 
     @property
     def waits(self) -> float:
-        """Return how long drives wait for the host's heartbeat [s]."""
+        """Return how long drives wait for the host's heartbeat [s]: `host_timeout`, or `timeout` without it."""
         return self.timeout if self.host_timeout is None else self.host_timeout
 
     @model_validator(mode="after")
@@ -304,7 +304,7 @@ class CanopenDriver(ExtendedSection):
         return max(self.watchdog_seconds(drive) for drive in self.drives)
 
     def watchdog_seconds(self, drive: CanopenDrive) -> float:
-        """Return the time after which a drive's watchdog trips when its signal stays away [s]."""
+        """Return after how long without its signal a drive's watchdog trips [s]: its own setting, or its signal's."""
         times = {
             "rpdo_timer": self.torque_deadline,
             "heartbeat": self.heartbeats.waits,
@@ -314,11 +314,11 @@ class CanopenDriver(ExtendedSection):
 
     @property
     def sheets(self) -> tuple[DataSheet, ...]:
-        """Return the data sheet (EDS) of each drive."""
+        """Return the parsed data sheet (EDS) of each drive, in the order of `drives`."""
         return tuple(data_sheet(self.sheet_file(number).text) for number in range(len(self.drives)))
 
     def sheet_file(self, number: int) -> TextFile:
-        """Return the file of a drive's data sheet: its own, or the one common to all drives."""
+        """Return the data sheet's file of the drive with this index: its own `eds`, or the one common to all."""
         return self.drives[number].eds or self.eds
 
     @property
@@ -333,7 +333,7 @@ class CanopenDriver(ExtendedSection):
 
     @property
     def torque_reports(self) -> Literal["cyclic", "status", "none"]:
-        """Return whether drives report measured torque in every cycle, with their status, or not at all."""
+        """Return how drives report measured torque: every cycle, with the status, or not; as described or by EDS."""
         if self.measured_torque is not None:
             return self.measured_torque
         if self.streams == "position":
@@ -342,7 +342,7 @@ class CanopenDriver(ExtendedSection):
 
     @property
     def status_frame(self) -> Literal["own", "position"]:
-        """Return whether the status word has a frame of its own, or is sent with the position."""
+        """Return `own` if the status word has its own PDO, `position` if it is sent there: as described, or by EDS."""
         if self.status.frame is not None:
             return self.status.frame
         lacking = any(sheet.has(0x1800, 1) and not sheet.has(0x1801, 1) for sheet in self.sheets)
@@ -350,13 +350,16 @@ class CanopenDriver(ExtendedSection):
 
     @property
     def drives_a_frame(self) -> int:
-        """Return how many drives a frame of targets is for, at most; two of 32 bits fit, but no dummies do."""
+        """Return the largest number of drives per frame of targets: 4, or 1 for 32-bit targets and `single` frames.
+
+        Four torques of 16 bits share a frame. Two of 32 bits would fit, but no dummies do.
+        """
         wide = self.streams == "position" or any(drive.torque_shift is not None for drive in self.drives)
         return 1 if wide or self.torque_frames == "single" else _SLOTS
 
     @property
     def report_delay(self) -> float:
-        """Return the largest delay with which a drive reports a change of its status [s], beside that of a cycle."""
+        """Return the longest delay of a status change [s] beyond a cycle: the inhibit time, 0 without own frame."""
         return self.status.inhibit if self.status_frame == "own" else 0.0
 
     @model_validator(mode="after")
@@ -394,7 +397,7 @@ def motor_speeds(transmission: Transmission, velocities: Sequence[float | None])
 
 
 def joint_torques(driver: CanopenDriver, transmission: Transmission) -> list[float]:
-    """Return the most that each joint can be given when the others are given nothing [N m or N].
+    """Return the largest torque or force that each joint's motors can give while other joints get none [N m or N].
 
     Args:
         driver: the section `driver`, with as many drives as ratios.
@@ -410,7 +413,7 @@ def joint_torques(driver: CanopenDriver, transmission: Transmission) -> list[flo
 
 
 def motor_torques(driver: CanopenDriver, transmission: Transmission, torques: Sequence[float | None]) -> list[float]:
-    """Return the torque of each motor that keeps all joints within their limits, whatever the other motors give [N m].
+    """Return the largest torque of each motor [N m] that keeps all joints within their limits, whatever others give.
 
     Args:
         driver: the section `driver`, with as many drives as ratios.
@@ -430,7 +433,7 @@ def motor_torques(driver: CanopenDriver, transmission: Transmission, torques: Se
 def quick_stop_decelerations(
     driver: CanopenDriver, transmission: Transmission, accelerations: Sequence[float | None]
 ) -> list[int | None]:
-    """Return the value of 6085h for each drive, None where nothing determines it.
+    """Return 6085h of each drive [counts/s^2]: its own setting, else from the joints' limits; None without either.
 
     Args:
         driver: the section `driver`.
@@ -463,7 +466,7 @@ def disagreements(
     velocities: Sequence[float | None] = (),
     torques: Sequence[float | None] = (),
 ) -> Iterator[tuple[tuple[str | int, ...], str]]:
-    """Yield what is inconsistent with an arm of these joints: the place in the file, and the mistake.
+    """Yield (key path, message) for each contradiction of section `driver` with joints, homes, gears, rate or limits.
 
     Args:
         driver: the section `driver`.

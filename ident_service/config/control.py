@@ -47,7 +47,7 @@ class Realtime(Section):
 
 
 def disagreements(control: Control, joints: Sequence[str]) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Yield what is inconsistent with an arm of these joints: the place in the file, and the mistake.
+    """Yield (key path, message) where `velocity_cutoff` has not one value per joint.
 
     Args:
         control: the section `control`.

@@ -53,7 +53,7 @@ class TorquePath(Section):
 
     @property
     def wide(self) -> bool:
-        """Return whether the target has 32 bits, so that one frame carries it for one drive."""
+        """Return whether the torque target is an entry of 32 bits, of which a frame carries only one."""
         return self.target.endswith("/i32")
 
     @model_validator(mode="after")
@@ -99,7 +99,7 @@ class TorqueUnit(Section):
 
     @property
     def of_current(self) -> bool:
-        """Return whether a count is of a current."""
+        """Return whether the drive's torque counts are counts of motor current: `unit` is `mA` or `own`."""
         return self.unit in ("mA", "own")
 
 
@@ -115,7 +115,7 @@ class TorqueLimit(Section):
     below: Annotated[int, Field(strict=True, ge=1)] | None = None
 
     def held(self, counts: int) -> int:
-        """Return what the entry holds for a largest torque, or the largest torque for what it holds [counts]."""
+        """Convert a torque limit [counts] to the entry's value, or back: `below` less it; unchanged without `below`."""
         return counts if self.below is None else max(self.below - counts, 0)
 
 
@@ -162,12 +162,12 @@ class Family(Section):
         return self
 
     def over(self, generic: Family) -> Family:
-        """Return this family, completed with the values of `generic` where it has none."""
+        """Return a copy of `generic` in which the keys that this family's file sets replace its own."""
         return generic.model_copy(update={key: getattr(self, key) for key in self.model_fields_set})
 
 
 def family_from(name: str, text: str) -> Family:
-    """Read a family of drives from YAML.
+    """Read the description of a drive family from YAML text; raises DriverError if it does not fit the schema.
 
     Args:
         name: of the file.

@@ -65,7 +65,7 @@ class DataSheetEntry:
 
     @property
     def writable(self) -> bool:
-        """Return whether a host may write the entry."""
+        """Return whether the entry's access type lets a host write it: rw, rww, rwr or wo."""
         return self.access in ("rw", "rww", "rwr", "wo")
 
     @property
@@ -74,7 +74,7 @@ class DataSheetEntry:
         return self.access != "wo"
 
     def number(self, node: int) -> int | None:
-        """Return the entry's value as a number, None where it has none.
+        """Return the entry's value as a number in any notation that makers use; None where it is empty or unreadable.
 
         Args:
             node: node number that COB-IDs are relative to.
@@ -82,7 +82,7 @@ class DataSheetEntry:
         return None if self.text is None else _number(self.text, node)
 
     def standard_number(self, node: int) -> int | None:
-        """Return the entry's value as `number`, but only of the notations of CiA 306-1: 10, 017, 0xA, $NODEID+0xA.
+        """Return the entry's value if in a notation of CiA 306-1 (10, 017, 0xA, $NODEID+0xA); None for others.
 
         What is written otherwise has no certain meaning: is 1e5 a hundred thousand, or 485?
         """
@@ -96,7 +96,7 @@ class DataSheetEntry:
 
     @property
     def hexadecimal(self) -> bool:
-        """Return whether the value stands as hexadecimal digits, which may be those of a negative number."""
+        """Return whether the text of the value contains `0x`; such digits may be those of a negative number."""
         return "0x" in (self.text or "").lower()
 
 
@@ -119,13 +119,13 @@ class DataSheet:
     cut_off: str = ""
 
     def has(self, index: int, sub: int | None = None) -> bool:
-        """Return whether the data sheet lists an object, or one sub-index of it."""
+        """Return whether the data sheet lists the object `index`, or, with `sub`, this one sub-index of it."""
         return any(key >> 8 == index for key in self.entries) if sub is None else index << 8 | sub in self.entries
 
 
 @lru_cache(maxsize=32)
 def data_sheet(text: str) -> DataSheet:
-    """Parse the text of an EDS or DCF; never raises, what cannot be read is left out."""
+    """Parse an EDS or DCF; never raises: unreadable entries are left out, `mistake` says why a whole text is no EDS."""
     if len(text) > LONGEST:
         return DataSheet(mistake=f"longer than {LONGEST} characters")
     sections = _sections(text)

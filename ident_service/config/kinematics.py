@@ -29,7 +29,7 @@ _RPY = re.compile(r"""(\brpy\s*=\s*)(["'])([^"']*)\2""")
 
 
 def snap_angles(urdf: str) -> str:
-    """Return the URDF with `rpy` angles that are nearly multiples of 15 degrees replaced by the exact multiples."""
+    """Return the URDF text with `rpy` angles within 2 mrad of a multiple of 15 degrees set to that multiple."""
 
     def angle(text: str) -> str:
         try:
@@ -47,7 +47,7 @@ def snap_angles(urdf: str) -> str:
 
 
 def angles_barely_rounded(angles: Iterable[float]) -> bool:
-    """Return whether angles [rad] near multiples of 15 degrees differ from them, and by 1e-5 at most.
+    """Return whether some angle [rad] is a rounded multiple of 15 degrees, and all near multiples are within 1e-5 rad.
 
     So 1.5708 is a rounded pi/2, and a calibrated 1.5703 beside it shows that nothing is to be taken as exact.
     """

@@ -50,7 +50,7 @@ def find_arm(arm: str) -> Path:
 
 
 def load_arm(arm: str | Path, *, upload: bool = False) -> ArmConfig:
-    """Read and check an arm description.
+    """Return the checked description of a YAML file or shipped arm; raises ConfigError with every mistake in it.
 
     Args:
         arm: a YAML file, or the name of a shipped description.
@@ -74,7 +74,7 @@ def load_arm(arm: str | Path, *, upload: bool = False) -> ArmConfig:
 
 
 def with_sheets(config: ArmConfig, files: Sequence[str]) -> ArmConfig:
-    """Return the arm's description with its emulated drives described by makers' data sheets.
+    """Return the description whose emulated CANopen drives have these EDS or DCF files; unchanged for no files.
 
     Args:
         config: of the arm.
@@ -98,7 +98,7 @@ def with_sheets(config: ArmConfig, files: Sequence[str]) -> ArmConfig:
 
 
 def sheet_file(name: str) -> TextFile:
-    """Read an EDS or DCF file of any encoding; raises UsageError."""
+    """Read an EDS or DCF file of any encoding as text; raises UsageError where it cannot be read."""
     try:
         return TypeAdapter(AnyTextBeside).validate_python(name)
     except ValidationError as error:
@@ -106,7 +106,7 @@ def sheet_file(name: str) -> TextFile:
 
 
 def arm_from_json(path: Path) -> ArmConfig:
-    """Read the complete description that a folder of results or a recording contains.
+    """Read the complete description that results or a recording store as JSON; raises ConfigError where it is none.
 
     Raises:
         UsageError: no such file.
@@ -141,7 +141,7 @@ def _count(data: bytes) -> int:
 
 
 def load_recording_format(path: str | Path) -> RecordingFormat:
-    """Read and check a YAML file that has the keys of an arm description's `recording` and nothing else.
+    """Return the checked content of a YAML file with the keys of an arm description's `recording` only.
 
     Raises:
         UsageError: no such file.
@@ -151,7 +151,7 @@ def load_recording_format(path: str | Path) -> RecordingFormat:
 
 
 def load_payload(path: str | Path) -> Payload:
-    """Read and check a YAML file that has the keys of an arm description's `payload` and nothing else.
+    """Return the checked content of a YAML file with the keys of an arm description's `payload` only.
 
     Raises:
         UsageError: no such file.
@@ -179,7 +179,7 @@ def folder_of(arm: str | Path, where: KeyPath) -> Path:
 
 
 def config_error(arm: str | Path, where: KeyPath, message: str) -> ConfigError:
-    """Return the error for a mistake that only shows when a description is used, with its place in the file.
+    """Build, but do not raise, a ConfigError with the place of a key in the YAML file, for mistakes found in use.
 
     Args:
         arm: a YAML file, or the name of a shipped description.
@@ -190,7 +190,7 @@ def config_error(arm: str | Path, where: KeyPath, message: str) -> ConfigError:
 
 
 def located(arm: str | Path, where: KeyPath, message: str) -> Problem:
-    """Return a message with its place in a description, as `config_error`."""
+    """Return a Problem: a message with file, line and column of a description's key or its nearest ancestor."""
     path = find_arm(str(arm))
     return read_tree(path).problem(where, message, path)
 
@@ -204,7 +204,7 @@ def _validated(kind: type[_Described], tree: Tree, path: Path, context: dict[str
 
 
 def nested(schema: Mapping[str, Any], document: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
-    """Yield a part of a schema, what it refers to, and every member of its anyOf and allOf, again and again.
+    """Yield a part of a JSON schema and, recursively, what its `$ref`, `anyOf` and `allOf` lead to.
 
     Args:
         schema: the part.
@@ -227,11 +227,11 @@ class KnownKeys:
         self._root = self._document["definitions"][section] if section else self._document
 
     def description(self, where: Sequence[str | int], value: Any) -> str:
-        """Return the words of a key; `value` is the file's. Empty for a key that is not known."""
+        """Return the schema's description of a key; empty for an unknown key. `value` is the file's whole content."""
         return next((str(one["description"]) for one in self._at(where, value) if "description" in one), "")
 
     def unit(self, where: Sequence[str | int], value: Any) -> str:
-        """Return the unit of a key or, of an item in a list, of the nearest key above it; empty for none."""
+        """Return the schema's unit of a key or, for an item of a list, of the key above it; empty for none."""
         for length in range(len(where), 0, -1):
             if found := next((str(one["x-unit"]) for one in self._at(where[:length], value) if "x-unit" in one), ""):
                 return "" if found == "1" else found
@@ -240,7 +240,7 @@ class KnownKeys:
         return ""
 
     def remedy(self, where: Sequence[str | int], value: Any) -> str:
-        """Return what to do about an unknown key: the key that is meant, where it belongs, or what is known there."""
+        """Return the end of a message on an unknown key: likely spelling, where it belongs, or known keys."""
         *above, word = where
         key = str(word)
         here = self._keys_at(above, value)
@@ -258,7 +258,7 @@ class KnownKeys:
         return did_you_mean(key, here) or f"; leave it out: known here are {', '.join(here)}"
 
     def items(self, where: Sequence[str | int], value: Any) -> int | None:
-        """Return how many items a list has; None where that is free."""
+        """Return the number of items that the schema wants of a list (`minItems`); None where that is free."""
         return next((int(one["minItems"]) for one in self._at(where, value) if "minItems" in one), None)
 
     def _keys_at(self, where: Sequence[str | int], value: Any) -> list[str]:
@@ -302,7 +302,7 @@ class KnownKeys:
 
 
 def fits_kind(value: Mapping[str, Any], part: Mapping[str, Any], document: Mapping[str, Any]) -> bool:
-    """Return whether a mapping is of the kind that a part of a schema describes."""
+    """Return whether the mapping's `kind` is one that the schema part allows; True where either has no `kind`."""
     kinds = [one["properties"]["kind"] for one in nested(part, document) if "kind" in one.get("properties", {})]
     return "kind" not in value or not kinds or any(value["kind"] == one.get("const") for one in kinds)
 

@@ -136,7 +136,7 @@ class Supply(Section):
 
     @property
     def budget(self) -> float:
-        """Return the power that the drives may draw, the smaller of both limits [W]."""
+        """Return the power that drives may draw [W]: the smaller of `power` and current times voltage; or inf."""
         from_current = float("inf") if self.current is None or self.voltage is None else self.current * self.voltage
         return min(self.power or float("inf"), from_current)
 
@@ -144,7 +144,7 @@ class Supply(Section):
 def disagreements(
     geometry: Geometry, workspace: Workspace, supply: Supply | None, joints: Sequence[str]
 ) -> Iterator[tuple[tuple[str | int, ...], str]]:
-    """Yield what is inconsistent with an arm of these joints: the place in the file, and the mistake.
+    """Yield (key path, message) for unknown joints in `geometry` and `workspace`, and a wrong count in `supply.loss`.
 
     Args:
         geometry: the section `geometry`.
@@ -208,7 +208,7 @@ class Design(Section):
 
 
 def design_disagreements(design: Design, joints: Sequence[str]) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Yield what is inconsistent with an arm of these joints: the place in the file, and the mistake.
+    """Yield (key path, message) where `design.position_margin` has not one value per joint.
 
     Args:
         design: the section `design`.

@@ -36,20 +36,20 @@ class MotorLimits:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Return names for sentences, in the order of the transmission's ratios."""
+        """Return names of the motors for messages, `motor 1` and so on, in the order of the transmission's ratios."""
         return tuple(f"motor {number + 1}" for number in range(len(self.torque)))
 
     def used(self, torque: Vector) -> Vector:
-        """Return shares of the motors' limits for joint torques [N m or N], each of shape (..., joints)."""
+        """Return each motor's share of its torque limit for joint torques [N m or N], shape (..., motors)."""
         return np.asarray(np.abs(torque @ self.to_motors.T) / self.torque)
 
     def used_of_joints(self, torque: Vector) -> Vector:
-        """Return the share of the limit of the motor that has most to do among those each joint shares, as `used`."""
+        """Return per joint the largest share of its limit among motors that move the joint, shape (..., joints)."""
         shares = np.where(self.together, self.used(torque)[..., None, :], 0.0)
         return np.asarray(shares.max(axis=-1))
 
     def limited(self, torque: Vector) -> Vector:
-        """Return joint torque within the motors' limits [N m or N], shape (joints,).
+        """Return joint torques [N m or N] scaled down until no motor exceeds its limit, shape (joints,).
 
         Joints that share motors are scaled by one factor, so that no joint is pushed the other way, as drives do that
         are asked for too much (`drivers/motor_units.py`).
@@ -89,7 +89,10 @@ class MotionLimits:
 
 
 def motor_limits(config: ArmConfig) -> MotorLimits | None:
-    """Collect the limits of motors that share joints: of `transmission.motor_torque`, or of the drives; else None."""
+    """Return the torque limits of motors that share joints; None if no two share one, or no motor's limit is known.
+
+    Limits are those of `transmission.motor_torque` or of the drives, whichever is smaller.
+    """
     gears = config.transmission
     if gears is None or gears.coupling is None:
         return None
@@ -109,7 +112,7 @@ def motor_limits(config: ArmConfig) -> MotorLimits | None:
 
 
 def motion_limits(config: ArmConfig) -> MotionLimits:
-    """Collect limits and gains of all joints.
+    """Return limits, gains and home of all joints as arrays; raises MotionRefused that names all that is missing.
 
     Raises:
         MotionRefused: the description leaves out something that a safe motion needs; all gaps are named.

@@ -63,7 +63,7 @@ class Payload(Section):
 
     @property
     def parameters(self) -> tuple[float, ...]:
-        """Return what it adds to Lxx Lxy Lxz Lyy Lyz Lzz lx ly lz m of its link [SI]."""
+        """Return what the payload adds to Lxx Lxy Lxz Lyy Lyz Lzz lx ly lz m of the link that carries it [SI]."""
         x, y, z = self.center_of_mass
         m = self.mass
         xx, xy, xz, yy, yz, zz = self.inertia or (0.0,) * 6
@@ -79,14 +79,14 @@ class Payload(Section):
 
     @property
     def words(self) -> str:
-        """Return a phrase for people."""
+        """Return a phrase for people: the payload's mass, its center of mass and the link that carries it."""
         x, y, z = self.center_of_mass
         where = "the last link" if self.link is None else f"the link of {self.link}"
         return f"{self.mass:g} kg at ({x:g}, {y:g}, {z:g}) m of {where}"
 
 
 def constraints_with_payload(config: ArmConfig) -> ArmConfig:
-    """Return the description with what is known of its bodies said of the arm that carries its payload.
+    """Return the description with mass bounds raised by the payload, and without the shape of the link that carries it.
 
     Bounds of masses move by the payload's mass. What is known about the shape of the link that carries it (box, hull,
     ellipsoid, symmetry) is left out: it is not known of both together.

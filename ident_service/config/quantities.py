@@ -64,7 +64,7 @@ class ExtendedSection(Section):
 
 
 def did_you_mean(word: str, known: Iterable[str], cutoff: float = 0.6) -> str:
-    """Return the known word that is nearest to a misspelt one, in a phrase to end a message; empty for none near."""
+    """Return `; did you mean 'X'?` with the known word nearest to a misspelt one; empty where none is near."""
     lower = {one.lower(): one for one in known}
     near = difflib.get_close_matches(word.lower(), lower, n=1, cutoff=cutoff)
     return f"; did you mean {lower[near[0]]!r}?" if near else ""
@@ -114,10 +114,10 @@ class TextFile(Section):
 
 
 def read_relative_file(value: Any, info: ValidationInfo) -> Any:
-    """Read the file that a `LocatedStr` names, relative to the YAML file it stands in; bounded in size, and UTF-8.
+    """Return name and text of the file that a `LocatedStr` names (bounded, UTF-8); other values unchanged.
 
-    Where the validation's context names that folder as `upload`, only files in it are read, and none is looked for
-    elsewhere: who sends a description learns nothing about other files.
+    Where the validation's context names the folder of the YAML file as `upload`, only files in it are read, and none is
+    looked for elsewhere: who sends a description learns nothing about other files.
     """
     return _read(value, info, lambda data: data.decode("utf-8"))
 

@@ -107,7 +107,7 @@ class Column(Section):
         return self.column if self.unit is None and self.factor == 1.0 else serialized(self)
 
     def si_factor(self, name: str) -> float:
-        """Return the factor to SI for a number of this column, whose quantity `name` says; check that its unit fits.
+        """Return the factor from this column's numbers to SI; raises ValueError where its unit does not fit.
 
         Args:
             name: name of the column in `ident`'s own files, such as `tau3`, which says the quantity.
@@ -158,7 +158,7 @@ class Transmission(ExtendedSection):
 
     @property
     def coupling_matrix(self) -> NDArray[np.float64]:
-        """Return `coupling`, or the identity where each motor has its own joint, shape (motors, joints)."""
+        """Return the matrix `coupling`, or the identity where the description has none, shape (motors, joints)."""
         return np.eye(len(self.ratios)) if self.coupling is None else np.array(self.coupling)
 
     @field_validator("ratios")
@@ -204,7 +204,7 @@ class Transmission(ExtendedSection):
 
 
 def motor_groups(transmission: Transmission) -> NDArray[np.bool_]:
-    """Tell which motors move each joint, directly or through other joints, shape (joints, motors)."""
+    """Return a mask of the motors that move each joint, directly or through other joints, shape (joints, motors)."""
     moves = transmission.coupling_matrix != 0.0
     found = moves.T
     for _ in transmission.ratios:
@@ -224,7 +224,7 @@ def motor_disagreements(
     joints: Sequence[str],
     rate: float,
 ) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Yield what is inconsistent between motors on a bus, gears and joints: the place in the file, and the mistake.
+    """Yield (key path, message) for each contradiction between motors on a bus, gears, joints and `lost_cycles`.
 
     Args:
         what: the motors' name, and their key in the section `driver`.
@@ -310,7 +310,7 @@ class RecordingFormat(Section):
 
     @property
     def motor_sides(self) -> tuple[bool, bool]:
-        """Return for positions (with velocities) and for torques whether they were measured at the motors."""
+        """Return two flags: whether positions (and velocities), and whether torques, were measured at the motors."""
         return self.side == "motor", (self.torque_side or self.side) == "motor"
 
     @field_validator("joint_names")
@@ -331,7 +331,7 @@ def _joints(columns: Mapping[str, Column]) -> int:
 
 
 def mismatched_units(form: RecordingFormat, joints: Sequence[str], revolute: Sequence[bool]) -> Iterator[str]:
-    """Yield columns with a unit of a prismatic joint where the arm's joint is revolute, or vice versa.
+    """Yield a message for each column in a prismatic joint's unit where the joint is revolute, or vice versa.
 
     Quantities measured at a motor are rotary whatever the joint is, and are not checked.
 
@@ -359,7 +359,7 @@ def mismatched_units(form: RecordingFormat, joints: Sequence[str], revolute: Seq
 def disagreements(
     form: RecordingFormat, transmission: Transmission | None, joints: Sequence[str]
 ) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Yield what is inconsistent in an arm of these joints: the place in the file, and the mistake.
+    """Yield (key path, message) for each contradiction of section `recording` with transmission and joints.
 
     Args:
         form: the section `recording`.

@@ -189,7 +189,7 @@ class SimulatedDriver(ExtendedSection):
 def disagreements(
     driver: SimulatedDriver, joints: Sequence[str], rate: float
 ) -> Iterator[tuple[tuple[str | int, ...], str]]:
-    """Yield what is inconsistent with an arm of these joints: the place in the file, and the mistake.
+    """Yield (key path, message) for each contradiction of the simulated driver with rate and joints.
 
     Args:
         driver: the section `driver`.

@@ -24,12 +24,12 @@ _FOLDERS = (Path(__file__).parent.parent / "configs", Path(__file__).parent.pare
 
 
 def shipped_arms() -> dict[str, Path]:
-    """Return names and files of the arm descriptions that come with this package."""
+    """Return the files of the arm descriptions that come with this package, by name."""
     return {path.stem: path for path in sorted(_shipped_folder().glob("*.yaml"))}
 
 
 def arm_schema_file() -> Path:
-    """Return the JSON schema of descriptions that comes with this package (`tools/description_reference.py`)."""
+    """Return the path of the JSON schema of descriptions that comes with this package."""
     return _shipped_folder() / SCHEMA
 
 
@@ -54,7 +54,7 @@ class Tree:
     places: dict[KeyPath, tuple[Path, int, int]] = field(default_factory=dict)
 
     def problem(self, path: KeyPath, message: str, fallback: Path) -> Problem:
-        """Return a problem at `path`, or at its nearest ancestor that has a place in the file."""
+        """Return a Problem at a key's place, or its nearest ancestor's; at line 1 of `fallback` where none has one."""
         for length in range(len(path), -1, -1):
             if place := self.places.get(path[:length]):
                 return Problem(*place, message)
@@ -62,7 +62,7 @@ class Tree:
 
 
 def first_problems(problems: Sequence[Problem]) -> list[Problem]:
-    """Return the first hundred problems of a file, in at most 500 characters each, and how many others there are."""
+    """Return a file's first 100 problems, each cut to 500 characters, and one more that counts the others."""
     first = [replace(one, message=_shortened(one.message)) for one in problems[:MOST_PROBLEMS]]
     if (more := len(problems) - len(first)) > 0:
         first.append(replace(first[-1], message=f"and {more} more mistakes"))
@@ -74,7 +74,7 @@ def _shortened(message: str) -> str:
 
 
 def read_tree(path: Path, _chain: tuple[Path, ...] = (), *, upload: bool = False) -> Tree:
-    """Read a YAML file and, underneath it, the file or shipped description that its `extends` names.
+    """Read a YAML file merged over the file or shipped description that its `extends` names; raises ConfigError.
 
     Mappings merge key by key, everything else is replaced.
 
@@ -136,7 +136,7 @@ def _merge(base: Any, over: Any, where: KeyPath, replaced: set[KeyPath]) -> Any:
 
 
 def read_without_base(path: Path) -> Tree:
-    """Read a single YAML file without the one that it `extends`.
+    """Read a single YAML file, with the place of each key, without the one that it `extends`; raises ConfigError.
 
     Raises:
         ConfigError: unreadable file, bad YAML, or something refused.

@@ -80,7 +80,7 @@ def bootstrap(
     level: float = 0.95,
     progress: Progress = lambda _done, _all: None,
 ) -> Bootstrap:
-    """Repeat the estimate for recordings resampled from blocks drawn with replacement.
+    """Repeat the estimate for resampled blocks; return the repeats' covariance and percentile intervals.
 
     Args:
         equations: equations that `fit` solves, in blocks of time.
@@ -141,7 +141,7 @@ def constrained_intervals(
     conditions: FeasibleSet,
     prior: Prior | None = None,
 ) -> Array:
-    """Return 95 % intervals of a constrained estimate from a parametric bootstrap in the feasible set.
+    """Return 95 % intervals of a constrained estimate from a parametric bootstrap, shape (base, 2).
 
     Unconstrained estimates are drawn around the constrained one with the covariance of the unconstrained, and each is
     constrained again. There are 40 replicates, or 20 where base parameters are many, so that it takes a fraction of a
@@ -185,7 +185,7 @@ def constrained_intervals(
 
 
 def block_resample_counts(rng: np.random.Generator, count: int, length: int) -> NDArray[np.int64]:
-    """Return how often each of `count` blocks is drawn, in runs of `length` and `count` in all, shape (count,)."""
+    """Draw `count` blocks in random runs of `length`; return how often each block was drawn, shape (count,)."""
     starts = rng.integers(0, count, size=-(-count // length))
     chosen = ((starts[:, None] + np.arange(length)) % count).ravel()[:count]
     return np.bincount(chosen, minlength=count)
@@ -203,7 +203,7 @@ def _least_squares(
 
 
 def run_length(equations: Equations, fit: LeastSquares) -> int:
-    """Return how many consecutive blocks to draw together so that correlated neighbours stay together; at least 1.
+    """Return how many consecutive blocks to draw together, from their autocorrelation (Politis and White); at least 1.
 
     The rule of Politis and White (2004, corrected by Patton, Politis and White 2009) for the circular block bootstrap,
     from the autocorrelation of what each block adds to the estimate, pooled over the parameters.

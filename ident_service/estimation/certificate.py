@@ -81,7 +81,7 @@ class Statement:
 
     @property
     def rows(self) -> list[Mapping[str, Fraction]]:
-        """Return the left-hand sides of all linear equations on delta: K, then the equalities."""
+        """Return the left-hand sides of all equations on delta, by parameter name: K's, then the equalities'."""
         return [*self.K, *(entry.coefficients for block in self.equalities for entry in block.entries)]
 
     @property
@@ -91,7 +91,7 @@ class Statement:
 
 
 def exact_block(block: Block, names: Sequence[str]) -> ExactBlock:
-    """Return the block with its coefficients as decimals."""
+    """Return the block with each coefficient as the exact fraction of its shortest decimal, by parameter name."""
     entries = tuple(
         Affine({names[int(column)]: printed(row[column]) for column in np.flatnonzero(row)}, printed(constant))
         for row, constant in zip(block.F, block.f, strict=True)
@@ -100,24 +100,26 @@ def exact_block(block: Block, names: Sequence[str]) -> ExactBlock:
 
 
 def printed(value: float) -> Fraction:
-    """Return the number that a file shows: the shortest decimal that reads back as this float."""
+    """Return a float as the exact fraction of its shortest decimal that reads back, which is what files print."""
     return Fraction(repr(float(value)))
 
 
 def trace(block: ExactBlock, z: Sequence[Fraction]) -> Fraction:
-    """Return the trace of a multiplier, or the sum of its numbers."""
+    """Return the trace of a symmetric matrix given by its upper triangle; for a block of single numbers their sum."""
     return sum((v for v, n in zip(z, counts(block), strict=True) if n == 1), Fraction(0))
 
 
 def counts(block: ExactBlock) -> list[int]:
-    """Return how often each entry counts in an inner product of symmetric matrices."""
+    """Return how often each entry of an upper triangle stands in the matrix: 1 or 2; ones for a block of numbers."""
     return [1 if i == j else 2 for i, j in triangle(block.size)] if block.size else [1] * len(block.entries)
 
 
 def prove(
     statement: Statement, multipliers: Sequence[Array], y: Array
 ) -> tuple[list[list[Fraction]], list[Fraction]] | None:
-    """Round the multipliers, make the equations hold exactly, and check the rest exactly.
+    """Round multipliers to fractions that prove infeasibility exactly; return those of blocks and rows, or None.
+
+    With them no body has the parameters: the multipliers' value is negative, or zero with one not zero.
 
     Args:
         statement: statement that the multipliers prove.
@@ -125,7 +127,7 @@ def prove(
         y: multipliers of the statement's rows, shape (rows,).
 
     Returns:
-        Both in fractions, or None where rounding broke the proof.
+        Multipliers of each block and factors of the rows, in fractions; None where rounding broke the proof.
     """
     smallest = [_smallest(block, z) for block, z in zip(statement.blocks, multipliers, strict=True)]
     floor = min((value for value in smallest if value > 0.0), default=1e-12)
@@ -182,7 +184,7 @@ def repair(
     values: Mapping[Unknown, Fraction],
     weight: Callable[[Unknown], float],
 ) -> dict[Unknown, Fraction] | None:
-    """Change a few values so that linear equations hold exactly.
+    """Return the values, a few changed so that linear equations hold exactly; None where these contradict each other.
 
     Elimination on the residuals; each equation changes the unknown that stands in the fewest equations, so that
     decimals stay short, and of these the one with the largest weight times coefficient.
@@ -192,9 +194,6 @@ def repair(
         right: right-hand sides.
         values: approximate solution.
         weight: weight of an unknown; one with a larger weight is changed sooner.
-
-    Returns:
-        The values that solve the equations, or None where these contradict each other.
     """
     count: dict[Unknown, int] = {}
     for equation in equations:
@@ -253,17 +252,17 @@ class Part:
 
 
 def identity(part: Part) -> Array:
-    """Return the entries of the identity matrix, or of ones, shape (entries,)."""
+    """Return the upper triangle of the identity matrix, or ones for a part of single numbers, shape (entries,)."""
     return part.duplication.T @ np.eye(len(part.rows)).ravel() if part.matrix else np.ones(len(part.rows))
 
 
 def split(parts: Sequence[Part], z: Array) -> list[Array]:
-    """Return the rows of `z` that belong to each part, shape (entries, ...) each."""
+    """Split `z` into the rows that belong to each part, shape (entries, ...) each."""
     return np.split(z, np.cumsum([len(part.entries) for part in parts])[:-1])
 
 
 def central_path(parts: Sequence[Part], c: Array, z: Array, normals: Array) -> Iterator[Array]:
-    """Yield points of the central path of `minimise c.z` with a negative value.
+    """Yield points of the central path of `minimise c.z` over the cone, only those with negative c.z, to the optimum.
 
     Args:
         parts: the cone.
@@ -337,7 +336,7 @@ def _spectrum(part: Part, entries: Array) -> Array:
 
 
 def congruence_maps(parts: Sequence[Part], z: Array) -> list[Array] | None:
-    """Return per part the map of entries X -> L X L^T with Z = L L^T; None outside the interior of the cone."""
+    """Return per part the matrix from entries of X to those of L X L^T, Z = L L^T; None if Z is not inside."""
     maps = []
     for part, piece in zip(parts, split(parts, z), strict=True):
         if not part.matrix:
@@ -359,7 +358,7 @@ _INTERIOR = 1e-9
 
 
 def dual_candidates(blocks: Sequence[Block], null: Array, delta: Array) -> Iterator[list[Array]]:
-    """Yield multipliers with a negative value, best first; none where no strictly feasible dual is found.
+    """Yield approximate multipliers that prove infeasibility, most negative value first; none if none is found.
 
     Args:
         blocks: the conditions.
@@ -499,7 +498,7 @@ def certify(
     *,
     expressions: Sequence[str] | None = None,
 ) -> Certificate:
-    """Prove that base parameters are feasible, or that they are not.
+    """Return an exact proof that base parameters are feasible, or infeasible; undecided where neither verifies.
 
     Args:
         beta: base parameters in SI units as they are printed, shape (base,).
@@ -542,7 +541,7 @@ def certificate_arm(
     joints: Sequence[str] = (),
     expressions: Sequence[str] | None = None,
 ) -> Arm:
-    """Return the data of an arm that its certificate has to be about, in the decimals that a file holds.
+    """Return what a certificate states of an arm (names, K, conditions), as fractions of printed decimals.
 
     Args:
         name: of the arm.

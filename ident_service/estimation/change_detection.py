@@ -84,7 +84,7 @@ class Motion:
 
     @classmethod
     def of(cls, information: Information, beta: Array, places: Sequence[int] | None = None) -> Motion:
-        """Return the torque response of a recording from its equations.
+        """Build torque responses to base parameters, and RMS of torque and residual, from a recording's equations.
 
         Args:
             information: the equations.
@@ -102,7 +102,7 @@ class Motion:
         return cls(tuple(responses), np.sqrt(torque) / rows, np.sqrt(residual) / rows)
 
     def change(self, difference: Array) -> Array:
-        """Return the root mean square of each joint's change of torque [N m or N], shape (joints,)."""
+        """Return the RMS torque change of each joint [N m or N] for a difference of base parameters."""
         return np.array([float(np.linalg.norm(response @ difference)) for response in self.responses])
 
 
@@ -152,7 +152,7 @@ class Test:
 
     @property
     def sigma(self) -> float:
-        """Return the length of the difference in standard deviations; |z| of a single parameter."""
+        """Return the length of the difference in standard deviations, sqrt(T^2); |z| for a single parameter."""
         return float(np.sqrt(self.statistic))
 
 
@@ -215,7 +215,7 @@ class ParameterChange:
 
     @property
     def shares(self) -> tuple[Array, Array] | None:
-        """Return the torque changes of all differences together, as `torque_shares` does; None without a motion."""
+        """Return (`torque_share`, `residual_share`), each of shape (joints,); None where no motion is known."""
         if self.torque_share is None or self.residual_share is None:
             return None
         return self.torque_share, self.residual_share
@@ -228,7 +228,7 @@ class ParameterChange:
 
 
 def detect_change(first: ComparedEstimate, second: ComparedEstimate) -> ParameterChange:
-    """Compare two identifications of the same base parameters.
+    """Test whether base parameters differ between identifications: each, per physical effect, and all together.
 
     Args:
         first: the reference, the accepted one for example.
@@ -276,7 +276,7 @@ def detect_change(first: ComparedEstimate, second: ComparedEstimate) -> Paramete
 
 
 def holm(p: Sequence[float]) -> list[float]:
-    """Return the probabilities adjusted for multiple tests (Holm 1979), in the order given."""
+    """Return p-values adjusted for multiple tests (Holm 1979), in the order given, at most 1."""
     order = np.argsort(p, kind="stable")
     adjusted = np.empty(len(p))
     adjusted[order] = np.maximum.accumulate(np.arange(len(p), 0, -1) * np.asarray(p, dtype=float)[order])
@@ -284,7 +284,7 @@ def holm(p: Sequence[float]) -> list[float]:
 
 
 def torque_shares(first: ComparedEstimate, second: ComparedEstimate, difference: Array) -> tuple[Array, Array] | None:
-    """Return the relative change of predicted torques for a change of parameters, on the later known motion.
+    """Return RMS torque changes of a parameter difference as shares of torque, and of residual; None without a motion.
 
     Returns:
         Per joint, root mean square of the change over that of the torque, and over that of what the parameters
@@ -298,14 +298,14 @@ def torque_shares(first: ComparedEstimate, second: ComparedEstimate, difference:
 
 
 def relevant(shares: tuple[Array, Array] | None) -> bool:
-    """Return whether some joint's torque changes by a relevant share of both the torque and its residual."""
+    """Return whether a joint's torque changes by at least 1 % of its torque, 25 % of its residual; True for None."""
     if shares is None:
         return True
     return bool(np.any((shares[0] >= RELEVANT_TORQUE) & (shares[1] >= RELEVANT_RESIDUAL)))
 
 
 def parameter_groups(leading: Sequence[str]) -> dict[tuple[Kind, int], tuple[int, ...]]:
-    """Return the places of each physical effect's parameters, by its kind and the number of its joint or link.
+    """Return the indices of the parameters of each physical effect, by (kind, number of the joint or link from 1).
 
     Args:
         leading: the link parameter that each base parameter is named after.
@@ -318,7 +318,7 @@ def parameter_groups(leading: Sequence[str]) -> dict[tuple[Kind, int], tuple[int
 
 
 def difference_test(first: ComparedEstimate, second: ComparedEstimate, places: Sequence[int]) -> Test:
-    """Test that these parameters are the same in both identifications.
+    """Test (T^2) whether these base parameters differ between two identifications; the result has the p-value.
 
     Args:
         first: one set.
@@ -353,7 +353,7 @@ def difference_test(first: ComparedEstimate, second: ComparedEstimate, places: S
 
 
 def probability(statistic: float, directions: int, degrees: float) -> float:
-    """Return the probability of a larger T^2 by chance, with `degrees` of freedom of its covariances."""
+    """Return the p-value of a T^2 (Hotelling): F distribution for finite `degrees` of freedom, else chi-squared."""
     if np.isinf(degrees):
         return float(scipy.special.chdtrc(directions, statistic))
     below = max(degrees - directions + 1.0, 1.0)
@@ -404,7 +404,7 @@ class Cause:
 
 
 def causes(difference: Array, K: Array, names: Sequence[str], motion: Motion) -> list[Cause]:
-    """Return every possible single cause of a difference, the best explanation first.
+    """Return each body, friction or drive inertia that alone could explain a torque difference, best first.
 
     Args:
         difference: difference of base parameters, SI units, shape (base,).
@@ -437,7 +437,7 @@ def causes(difference: Array, K: Array, names: Sequence[str], motion: Motion) ->
 
 
 def meaning_of_cause(cause: Cause, links: int) -> str:
-    """Return the possible meaning of a cause, in words for a person at the arm.
+    """Return a sentence for people on what a cause may mean: by its kind, its sign, and if it is the last link.
 
     Args:
         cause: to explain.
@@ -449,14 +449,16 @@ def meaning_of_cause(cause: Cause, links: int) -> str:
 
 
 def meaning_of_effect(effect: Effect, found: ParameterChange, leading: Sequence[str], links: int) -> str:
-    """Return the possible meaning of an effect that no single cause explains, in words for a person at the arm."""
+    """Return a sentence for people on what a changed effect may mean at the arm, by its kind, sign and link."""
     if effect.kind == "friction":
         return _MEANINGS[_direction({leading[place]: float(found.difference[place]) for place in effect.places})]
     return _MEANINGS["last" if effect.number == links and effect.kind != "drive inertia" else effect.kind]
 
 
 def friction_ratio(first: ComparedEstimate, second: ComparedEstimate, joint: int) -> tuple[float, float] | None:
-    """Return the friction of a joint, second over first, at the root mean square of its speed.
+    """Return (friction of the second over the first, speed [rad/s or m/s] it is taken at); None where unknown.
+
+    The speed is the root mean square of the motion's.
 
     Args:
         first: the reference.

@@ -49,14 +49,14 @@ class Choice:
 
 
 def best_choice(option: str, held_out: Mapping[str, float]) -> Choice:
-    """Choose the alternative with the smallest held-out error; the first, unless another is better by a hundredth."""
+    """Choose the first alternative, unless another's held-out error is smaller by more than 1 %; then the smallest."""
     usual = next(iter(held_out))
     best = min(held_out, key=lambda name: held_out[name])
     return Choice(option, best if held_out[best] < _WORTH * held_out[usual] else usual, dict(held_out))
 
 
 def significant_choice(option: str, held_out: Mapping[str, Array]) -> Choice:
-    """Choose the first alternative, unless another predicts every third better, by more than the thirds differ.
+    """Choose the first alternative, unless another predicts every third clearly better; then the smallest error.
 
     Args:
         option: key in the configuration's section `identification`.
@@ -82,14 +82,14 @@ def significant_choice(option: str, held_out: Mapping[str, Array]) -> Choice:
 
 
 def of_thirds_together(held_out: Mapping[str, Array]) -> dict[str, float]:
-    """Return the root mean square of the thirds' torque errors [percent], per alternative."""
+    """Return per alternative the root mean square over the thirds' torque errors [percent]."""
     return {name: float(np.sqrt(np.mean(np.square(errors)))) for name, errors in held_out.items()}
 
 
 def held_out_thirds(
     parts: Sequence[Information], weights: Array, base: BaseParameters, conditions: FeasibleSet
 ) -> Array:
-    """Return the torque error of each part, predicted from the feasible estimate of the other parts.
+    """Return each part's torque error [percent] under the feasible estimate of the others; all inf if one fails.
 
     Args:
         parts: equations of consecutive stretches of time.
@@ -118,7 +118,7 @@ def held_out_thirds(
 
 
 def held_out_error(blocks: Sequence[Information], weights: Array) -> float:
-    """Return the torque error of the thirds of the recordings, each predicted from the other two.
+    """Return the torque error [percent] of thirds, each predicted from the others; infinite for under 3 blocks.
 
     Args:
         blocks: equations of consecutive stretches of time.

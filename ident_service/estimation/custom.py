@@ -48,14 +48,11 @@ class CustomFunction:
     def constraints(
         self, link: Mapping[str, cp.Expression], base: Mapping[str, cp.Expression]
     ) -> tuple[list[cp.Constraint], cp.Expression | None]:
-        """Call the function and return its checked constraints and penalty.
+        """Call the user's function; return its constraints, checked to be convex, and its penalty or None.
 
         Args:
             link: link parameters in SI units by their names (`m7`).
             base: base parameters in SI units by their expressions, as `ident base-parameters` prints them.
-
-        Returns:
-            Convex constraints, and the penalty or None.
 
         Raises:
             CustomError: the function raises, or returns something else or something that is not convex.
@@ -99,7 +96,7 @@ class CustomFunction:
 
 
 def load_custom(name: str, folder: Path) -> CustomFunction:
-    """Import the function that a description names.
+    """Import the function `module:function` that a description names; raises CustomError if that fails.
 
     Args:
         name: `module:function`.

@@ -94,7 +94,7 @@ class Equations:
 
     @cached_property
     def clusters(self) -> tuple[tuple[Information, ...], ...]:
-        """Return the blocks grouped by motion, in the order in which each motion was first seen.
+        """Return the blocks grouped by motion: repetitions of one motion are one group, in the order first seen.
 
         What the model lacks errs by the same torque in all blocks of a cluster: they are no independent evidence.
         """
@@ -106,12 +106,12 @@ class Equations:
 
     @cached_property
     def total(self) -> Information:
-        """Return the information of all blocks together."""
+        """Return the information of all blocks summed; rows near standstill that are kept apart are not in it."""
         return Information.sum(self.blocks)
 
     @cached_property
     def left_out(self) -> Information | None:
-        """Return the information of all rows near standstill, where they are apart; else None."""
+        """Return the summed information of rows near standstill; None where these are not kept apart."""
         return Information.sum(self.near) if self.near else None
 
     @cached_property
@@ -121,16 +121,16 @@ class Equations:
 
     @property
     def moving(self) -> Information:
-        """Return the information of all rows in motion, or of all rows where the motion reverses too often for any."""
+        """Return the information of rows in motion; of all rows where there are none in motion."""
         return self.total if self.total.rows.any() else self.everything
 
     def with_torques_times(self, scales: Array) -> Equations:
-        """Return the equations with each joint's torque multiplied by `scales`, shape (joints,)."""
+        """Return a copy with each joint's measured torque multiplied by `scales`, shape (joints,)."""
         blocks, near = (tuple(one.with_torques_times(scales) for one in part) for part in (self.blocks, self.near))
         return replace(self, blocks=blocks, near=near)
 
     def with_near(self, shares: Array) -> Equations:
-        """Return the equations with rows near standstill merged into the blocks, multiplied by `shares` per joint."""
+        """Return a copy with rows near standstill merged into the blocks, multiplied by `shares` per joint."""
         if not any(near.rows.any() for near in self.near):
             return self
         pairs = zip(self.blocks, self.near, strict=True)
@@ -146,7 +146,7 @@ def equations(
     *,
     judging: bool = False,
 ) -> Equations:
-    """Read recordings once and return their equations in blocks.
+    """Read recordings once; return regressor equations in base parameters, compressed to triangles, in blocks of time.
 
     Args:
         recordings: to read, one or several.
@@ -175,7 +175,7 @@ def equations_of(
     *,
     judging: bool = False,
 ) -> Equations:
-    """Gather the rows that a function gives, which may have further columns, as `equations` gathers its own.
+    """Compress the rows that `rows_of` yields for each recording into blocks of time; further columns are allowed.
 
     Args:
         recordings: to read.
@@ -198,7 +198,7 @@ def equations_of(
 
 
 def require_motion(recordings: Sequence[Recording], model: ArmModel, moved: NDArray[np.bool_]) -> None:
-    """Raise unless every joint moves in some recording.
+    """Raise RecordingError unless every joint in `moved` is True; return nothing.
 
     Args:
         recordings: recordings that `moved` is of.
@@ -253,7 +253,7 @@ def _question_of_unit(recordings: Sequence[Recording], model: ArmModel, still: S
 
 
 def cut_into_stretches(recordings: Sequence[Recording], model: ArmModel) -> tuple[Stretches, ...]:
-    """Divide each recording into the stretches of time that blocks are made of; see `repeats.stretches`.
+    """Return for each recording its division into time stretches, labelled so that repeats of a motion share a label.
 
     Raises:
         RecordingError: a recording cannot be read.
@@ -317,10 +317,9 @@ def _block_seconds(recording: Recording, model: ArmModel) -> float:
 
 
 def equation_rows(recording: Recording, model: ArmModel, base: BaseParameters, *, once: bool = False) -> Iterator[Rows]:
-    """Yield the equations themselves, in chunks, for methods that need more than one pass.
+    """Yield regressor and torque rows in chunks; recorded torque times motor factors, less a known payload's.
 
-    Recorded torques are multiplied by the factors of the motors that the description states, and lack what a known
-    payload needs. Rows stay in the recording's memory unless they are asked for `once`.
+    The description states the motors' factors. Rows stay in the recording's memory unless they are asked for `once`.
 
     Raises:
         RecordingError: the recording does not fit the arm or cannot be smoothed.
@@ -331,7 +330,7 @@ def equation_rows(recording: Recording, model: ArmModel, base: BaseParameters, *
 
 
 def rows_of_motion(motion: Motion, recording: Recording, model: ArmModel, base: BaseParameters) -> Rows:
-    """Return the equations of smoothed samples of a recording, such as some of them with other positions."""
+    """Return regressor and torque rows for given smoothed samples, torque corrected as `equation_rows` does."""
     rows = _rows(motion, _regressor(motion, model, base), motion.torque, model)
     return with_recorded_torque(rows, motion.torque, recording, model, base)
 
@@ -339,7 +338,7 @@ def rows_of_motion(motion: Motion, recording: Recording, model: ArmModel, base: 
 def with_recorded_torque(
     rows: Rows, torque: Array, recording: Recording, model: ArmModel, base: BaseParameters
 ) -> Rows:
-    """Return equations with other torques, shape (samples, joints), as recorded."""
+    """Return the rows with `torque`, shape (samples, joints), in place of theirs, corrected as recorded torque is."""
     return _of_links(replace(rows, torque=torque), recording, model, base, _torque_factors(model))
 
 
@@ -351,10 +350,7 @@ def _of_links(rows: Rows, recording: Recording, model: ArmModel, base: BaseParam
 
 
 def motors_of_torques(model: ArmModel) -> Array:
-    """Return what recorded joint torques are multiplied by to be those of the motors, shape (motors, joints).
-
-    Without gears in the description, motors are the joints.
-    """
+    """Return the matrix from recorded joint torques to motor torques, (motors, joints); identity without gears."""
     gears = model.config.transmission
     if gears is None:
         return np.eye(model.chain.joints)
@@ -381,7 +377,7 @@ def known_torque(recording: Recording, model: ArmModel, base: BaseParameters, ro
 
 
 def payload_parameters(model: ArmModel, payload: Payload) -> Array:
-    """Return what a payload adds to an arm's link parameters [SI], shape (parameters,)."""
+    """Return what a payload adds to each of the arm's link parameters [SI], zero for most, shape (parameters,)."""
     loaded = model.config.model_copy(update={"payload": payload})
     return with_payload(loaded, model.chain.names, model.layout, np.zeros(model.layout.size))
 
@@ -431,7 +427,7 @@ def _recorded_rows(recording: Recording, model: ArmModel, base: BaseParameters, 
 
 
 def motions_of(recording: Recording, model: ArmModel) -> Iterator[Motion]:
-    """Yield the smoothed samples of a recording in parts, or one mean period where its periods are averaged.
+    """Return an iterator over smoothed samples of a recording in parts, or over one mean period if `period` is set.
 
     Raises:
         RecordingError: the recording cannot be smoothed.
@@ -483,7 +479,7 @@ def _rows(motion: Motion, H_b: Array, torque: Array, model: ArmModel) -> Rows:
 
 
 def bounded(gathered: Equations) -> Equations:
-    """Merge blocks in pairs while there are more than `MAX_BLOCKS`: of the same motion, else neighbours."""
+    """Merge blocks in pairs until at most 256 are left: of the same motion first, else neighbours."""
     while len(gathered.blocks) > MAX_BLOCKS:
         pairs = _pairs(gathered.labels)
         blocks, near = (

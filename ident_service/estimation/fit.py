@@ -112,7 +112,7 @@ def prepare(
     *,
     torque_constants: Literal["described", "unconstrained", "feasible"] = "described",
 ) -> Prepared:
-    """Find delay, friction shape and torque constants, which make the equations linear, and gather the equations.
+    """Fit delay, friction shape and torque constants to the recordings; return them with the then linear equations.
 
     Args:
         recordings: recordings to fit to.
@@ -213,7 +213,7 @@ def _with_velocity(
 
 
 def gather(recordings: Sequence[Recording], model: ArmModel, base: BaseParameters) -> Equations:
-    """Return the equations of several recordings."""
+    """Read recordings and return their regressor equations in base parameters, in blocks of time."""
     return equations(recordings, model, base)
 
 
@@ -224,7 +224,7 @@ def unconstrained(
     base: BaseParameters,
     conditions: FeasibleSet,
 ) -> Fit:
-    """Estimate by a method, or by the one of `wls` and `huber` that predicts held-out thirds better.
+    """Estimate without conditions by a method; `choose` is `wls` or `huber`, by error on held-out thirds.
 
     The covariance has the doubt about the friction's shape and the torque constants in it, where those were fitted.
 
@@ -313,7 +313,7 @@ def _fit_with_uncertainty(method: Method, fit: LeastSquares, equations: Equation
 
 
 def allowed_change(fit: LeastSquares, base: BaseParameters, deviations: Array, beta: Array) -> ChangeEllipsoid | None:
-    """Return N of `central.py`: base-parameter changes of the links below a hundredth of their deviations.
+    """Return the ellipsoid of base-parameter changes of 1 % of their deviations; None where none is known.
 
     In the metric of eq. 81 a change of length 1 moves each parameter by at most its white deviation, which is no
     larger than the one that is told; so no torque changes by what could be seen. Friction does not move.

@@ -203,7 +203,7 @@ class FrictionTrials:
     def moments(
         self, presliding: Array, stribeck_velocity: Array, parts: Sequence[slice] | None = None
     ) -> list[Moments]:
-        """Return the products of the equations for one shape of the friction.
+        """Return the products of the equations' columns, per part of the samples, for one shape of the friction.
 
         Args:
             presliding: x0 per drive [rad or m], shape (drives,).
@@ -250,7 +250,7 @@ class FrictionTrials:
 
     @one_blas_thread()
     def equations(self, presliding: Array, stribeck_velocity: Array) -> Equations:
-        """Return the equations for one shape of the friction, in `FOLDS` blocks, rows near standstill apart.
+        """Return the equations for one shape of the friction, in three blocks (thirds), rows near standstill apart.
 
         Args:
             presliding: x0 per drive [rad or m], shape (drives,).
@@ -442,7 +442,7 @@ _RATE = 125.0  # Hz; friction changes slowly enough to be fitted on fewer rows
 
 
 def with_friction(model: ArmModel, shape: FrictionShape) -> ArmModel:
-    """Return the arm with these friction numbers; those still to be fitted stand at a middling value."""
+    """Return the arm with these friction numbers; a Stribeck velocity still to be fitted stands at 0.1."""
     model = model.with_options(friction=shape)
     velocity = 0.1 if shape.stribeck_velocity == "fit" else shape.stribeck_velocity
     if "stribeck" not in model.layout.terms:
@@ -452,7 +452,7 @@ def with_friction(model: ArmModel, shape: FrictionShape) -> ArmModel:
 
 
 def friction_trials(recordings: Sequence[Recording], model: ArmModel, base: BaseParameters) -> FrictionTrials:
-    """Read recordings for trials of friction, on fewer rows than the estimate has.
+    """Read recordings into thinned rows on which friction shapes can be tried quickly; raises RecordingError.
 
     Raises:
         RecordingError: a recording cannot be used.
@@ -461,7 +461,7 @@ def friction_trials(recordings: Sequence[Recording], model: ArmModel, base: Base
 
 
 def fitted_friction_parameters(model: ArmModel) -> tuple[str, ...]:
-    """Return the names of the friction numbers that are left to be fitted and apply to this arm."""
+    """Return which of `presliding` and `stribeck_velocity` are to be fitted and in this arm's friction terms."""
     shape, terms = model.config.identification.friction, set(model.layout.terms)
     if not {"coulomb", "stribeck"} & terms:
         return ()
@@ -471,7 +471,7 @@ def fitted_friction_parameters(model: ArmModel) -> tuple[str, ...]:
 
 
 def searched(key: str) -> float:
-    """Give the standard deviation of a number's logarithm if any value that is searched were as likely."""
+    """Return the standard deviation of a number's logarithm, if uniform over the range that is searched."""
     grid = _GRIDS[key][_GRIDS[key] > 0.0]
     return float(np.log(grid[-1] / grid[0]) / np.sqrt(12.0))
 
@@ -479,16 +479,13 @@ def searched(key: str) -> float:
 def fit_friction(
     trials: FrictionTrials | None, model: ArmModel, base: BaseParameters, conditions: FeasibleSet | None = None
 ) -> tuple[ArmModel, tuple[Choice, ...]]:
-    """Fit every number that the configuration leaves to be fitted.
+    """Fit the friction numbers left to `fit`; return the arm with them, and per kind whether it was fitted or left out.
 
     Args:
         trials: rows of the fitted recordings; None where nothing is to be fitted.
         model: the arm; `identification.friction` says what to fit.
         base: grouping of its parameters, which these numbers do not change.
         conditions: feasible set of the estimates that judge choices; nothing is chosen when None.
-
-    Returns:
-        The arm with its numbers, and for each kind whether it was fitted or left out.
     """
     shape = model.config.identification.friction
     wanted = fitted_friction_parameters(model)
@@ -513,7 +510,7 @@ def fit_friction(
 
 
 def at_search_bounds(shape: FrictionShape, joints: Sequence[str], terms: Sequence[str]) -> tuple[str, ...]:
-    """Describe the fitted numbers that lie at an end of the search: the true value may lie beyond, or not exist.
+    """Return a message per fitted friction number that lies at an end of its search range; empty for none.
 
     Args:
         shape: fitted shape of the friction.

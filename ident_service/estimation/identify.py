@@ -182,7 +182,7 @@ class Estimate:
 
     @property
     def feasible(self) -> bool:
-        """Return whether a real body could have these parameters."""
+        """Return whether a real body could have these parameters: the margin in the feasible set is positive."""
         return self.margin > 0.0
 
 
@@ -200,7 +200,7 @@ def identify(
     step: Callable[[str, float], None] = lambda words, share: None,
     torque_constants: bool = False,
 ) -> Estimate:
-    """Identify an arm from recordings.
+    """Identify an arm from recordings: fit, constrain to the feasible set, validate; return it with uncertainty.
 
     Args:
         model: the arm; its configuration says how to smooth, and what else to fit (delay, shape of the friction).

@@ -92,7 +92,7 @@ def instrumental_variables(
     fit: LeastSquares,
     delta: Array,
 ) -> InstrumentalEstimate:
-    """Refine an estimate by instrumental variables from simulated motions.
+    """Refine an estimate by repeated simulation of noise-free motions as instruments, until it settles (IDIM-IV).
 
     Args:
         recordings: recordings that `fit` was fitted to.
@@ -244,7 +244,7 @@ class SimulatedRecording:
         self._measured, self._stretches = measured, tuple(stretches)
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
-        """Yield the samples in order, `samples` at a time."""
+        """Yield blocks of the recording with simulated positions and no velocities, `samples` at a time."""
         for block in self._measured.blocks(samples):
             position = block.position.copy()
             for stamps, motion in self._stretches:
@@ -257,7 +257,7 @@ class SimulatedRecording:
 
 
 def simulated(recording: Recording, model: ArmModel, delta: Array, cutoff: float) -> SimulatedRecording:
-    """Return the recording as the arm would have made it without noise.
+    """Return the recording with the positions of a simulated, noise-free arm that follows it; torques stay.
 
     Args:
         recording: recording whose positions the simulated arm follows, and whose stamps and torques are kept.

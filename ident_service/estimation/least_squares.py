@@ -53,12 +53,12 @@ class LeastSquares:
 
     @cached_property
     def condition_number(self) -> float:
-        """Return that of W (2-norm, SI units); infinite when W has not full rank."""
+        """Return the condition number of the regressor W (2-norm, SI units); infinite when W has not full rank."""
         return float(np.linalg.cond(self.R1)) if self.rank == len(self.beta) else float("inf")
 
 
 def weighted_least_squares(information: Information) -> LeastSquares:
-    """Solve with each joint's equations divided by its residual's deviation, repeated until neither changes.
+    """Solve least squares with each joint divided by its residual's deviation, repeated until the weights settle.
 
     Raises:
         ModelError: the weights do not settle, which means that some joint's residual vanishes.
@@ -85,7 +85,7 @@ def _degrees(equations: Information | Moments) -> Array:
 
 
 def least_deviations(equations: Information | Moments) -> Array:
-    """Return what residuals' deviations count as at least [N m or N], far below each joint's torque, shape (joints,).
+    """Return the floor of each joint's residual deviation [N m or N], 1e-9 of its RMS torque, shape (joints,).
 
     A joint whose torque is always zero has those of the others.
     """
@@ -94,7 +94,7 @@ def least_deviations(equations: Information | Moments) -> Array:
 
 
 def ordinary_least_squares(information: Information, weights: Array | None = None) -> LeastSquares:
-    """Minimise |omega - W beta| (eq. 60) from the factors of the equations.
+    """Minimise |omega - W beta| (eq. 60); return the estimate with its triangular factors and standard deviations.
 
     Args:
         information: the equations.
@@ -149,7 +149,7 @@ def _solution(information: Information, weights: Array | None) -> _Solution:
 
 
 def unit_columns(matrix: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return what to divide each column by so that it has unit length, and which columns are more than rounding.
+    """Return the columns' lengths (1 for columns that are only rounding), and a mask of the columns that are not.
 
     The Stribeck column of rows that are all fast underflows; divided by its length it would be rounding of unit length.
     """
@@ -169,7 +169,7 @@ class TorqueError:
 
 
 def torque_error(information: Information, beta: Array) -> TorqueError:
-    """Return the torque error of `beta` on the equations of `information`."""
+    """Return relative [percent] and RMS torque errors of `beta` on these equations, for all joints and for each."""
     errors, torques = information.squared_residuals(beta), information.squared_torques()
     rows = np.maximum(information.rows, 1)
     return TorqueError(
@@ -202,11 +202,11 @@ class Moments:
     base: int
 
     def solved(self, weights: Array) -> Array:
-        """Return the least-squares estimate, each joint's equations multiplied by its weight; shape (base,)."""
+        """Return the least-squares base parameters, each joint's equations multiplied by its weight; shape (base,)."""
         return ridge(*self._normal(weights))
 
     def estimate(self) -> tuple[Array, Array]:
-        """Return the least-squares estimate and its deviations (eq. 81), shape (base,) each."""
+        """Return the unweighted least-squares estimate and its standard deviations (eq. 81), shape (base,) each."""
         total, right = self._normal(np.ones(len(self.products)))
         beta = ridge(total, right)
         variance = float(self.squared_residuals(beta).sum()) / max(int(self.rows.sum()) - self.base, 1)
@@ -229,7 +229,7 @@ class Moments:
         return total[:, :-1], total[:, -1]
 
     def weights(self, start: Array | None = None) -> Array:
-        """Return the factors of the joints' equations that make their residuals alike, shape (joints,).
+        """Return the factors of the joints' equations that make their residuals equally large, shape (joints,).
 
         Args:
             start: factors to begin with, such as those of other columns; ones when None.
@@ -256,7 +256,7 @@ class Moments:
 
 
 def ridge(products: Array, right: Array) -> Array:
-    """Solve normal equations by ridge regression: columns may be alike, unseen ones get zero.
+    """Solve normal equations with a tiny ridge, so that equal columns share; columns of zeros get zero.
 
     Args:
         products: products of the columns with each other, shape (columns, columns).

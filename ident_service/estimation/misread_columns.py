@@ -80,26 +80,30 @@ class Reading:
 
     @property
     def exchanges(self) -> bool:
-        """Return whether columns are exchanged; else those of one joint, or all, are read otherwise."""
+        """Return whether two joints' columns are exchanged; if not, the columns of one joint, or of all, change."""
         return len(self.joints) == 2 and not self.all_negated
 
     @property
     def negates(self) -> bool:
-        """Return whether signs are negated."""
+        """Return whether the reading only negates columns: no exchange, and `factor` is -1."""
         return not self.exchanges and self.factor == -1.0
 
     @property
     def is_measured(self) -> bool:
-        """Return whether it is about a scale, a zero or a time, which may have any value."""
+        """Return whether the reading fits a number (a scale, a zero or a time) instead of negating or exchanging."""
         return not (self.negates or self.exchanges)
 
     @property
     def of_torque_signs(self) -> bool:
-        """Return whether it is about signs of torques alone, which needs no other regressor."""
+        """Return whether only signs of torques are negated, which needs no other regressor."""
         return self.which == "torque" and self.negates
 
     def read(self, columns: Array, what: Literal["torque", "position"]) -> Array:
-        """Return positions, velocities or torques, shape (samples, joints), as they are read but for time and zero."""
+        """Return samples, (samples, joints), exchanged or scaled by this reading; unchanged if it is not about `what`.
+
+        `which` says whether the reading is about torques, positions (with velocities) or both. Time and zero are not
+        applied.
+        """
         if self.which not in (what, "both"):
             return columns
         read = columns.copy()
@@ -125,7 +129,7 @@ class MisreadColumns:
     after: TorqueError
 
     def sentence(self, names: Sequence[str]) -> str:
-        """Return a sentence: which columns were misread, so that the estimate must not be used, and what to correct.
+        """Return a sentence for people: which columns seem misread, the errors before and after, and what to correct.
 
         Args:
             names: of the joints.
@@ -189,7 +193,7 @@ class MisreadColumns:
 
 @one_blas_thread()
 def misread_columns(estimate: Estimate, recordings: Sequence[Recording]) -> MisreadColumns | None:
-    """Return the reading of the columns that explains recordings best, where it is far better than theirs; else None.
+    """Return the reading of the columns that predicts torques far better than the recorded one; None if none does.
 
     Nothing is tried where every joint's torque is predicted to a tenth, and all of them together to 4 %. Of the
     recordings at most a minute is fitted.
@@ -325,7 +329,7 @@ def weights_of_joints(as_read: TorqueError) -> Array:
 
 
 def gains(before: TorqueError, after: TorqueError) -> Array:
-    """Return per joint the logarithm of the factor by which its error shrinks, shape (joints,)."""
+    """Return per joint the logarithm of its torque error before over after, positive where better; shape (joints,)."""
     return _gains(before.joint_relative_percent, after.joint_relative_percent)
 
 

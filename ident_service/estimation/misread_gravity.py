@@ -54,11 +54,11 @@ class MisreadGravity:
 
     @property
     def gained(self) -> float:
-        """Return the logarithm of the factor by which the product of the joints' errors shrinks."""
+        """Return the sum over joints of the logarithm of the torque error before over after; positive is better."""
         return float(gains(self.before, self.after).sum())
 
     def sentence(self, names: Sequence[str]) -> str:
-        """Return a sentence: which gravity seems right, so that the estimate must not be used, and what to correct.
+        """Return a sentence for people: which gravity seems right, the errors before and after, and what to correct.
 
         Args:
             names: of the joints.
@@ -82,7 +82,7 @@ class MisreadGravity:
 
 @one_blas_thread()
 def misread_gravity(estimate: Estimate, recordings: Sequence[Recording]) -> MisreadGravity | None:
-    """Return the gravity that explains recordings best, where it is far better than the described one; else None.
+    """Return the gravity, none or along a base axis, that predicts torques far better than described; else None.
 
     Directions are those of the base frame's axes. Nothing is tried where all torques are predicted to 4 %. Of the
     recordings at most a minute is fitted.

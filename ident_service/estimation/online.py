@@ -92,12 +92,12 @@ class SequentialLeastSquares:
         self._need, self._done_ns, self._seconds = _FIRST, -1, 0.0
 
     def add(self, block: Block) -> None:
-        """Queue new samples, consecutive to those before."""
+        """Queue samples, consecutive to those before, for `step`; compute nothing."""
         self._waiting.append(block)
 
     @one_blas_thread()
     def step(self) -> bool:
-        """Process a bounded part of the queued samples; return whether the information grew."""
+        """Process a bounded part of the queued samples; return whether rows were added to the estimate."""
         if not self._waiting:
             return False
         whole = join(self._waiting)
@@ -154,7 +154,7 @@ class SequentialLeastSquares:
 
     @one_blas_thread()
     def uncertainty(self) -> ParameterUncertainty | None:
-        """Return the parameter uncertainty so far; None before there are more rows than parameters."""
+        """Return estimate, deviations and verdicts of the samples so far; None unless rows outnumber parameters."""
         information = self._information
         if int(information.rows.sum()) <= self.base.size:
             return None

@@ -162,7 +162,7 @@ class Payload:
     excess: Array | None = None
 
     def far(self) -> tuple[int, ...]:
-        """Return joints whose residual is far above that of the identification, and matters beside their torque."""
+        """Return the indices of joints whose residual is far above the identification's and more than 1 % of torque."""
         if self.excess is None:
             return ()
         matters = self.fitted.joint_relative_percent > 100.0 * RELEVANT_TORQUE
@@ -171,7 +171,7 @@ class Payload:
 
 @one_blas_thread()
 def identify_payload(arm: KnownArm, recorded: Equations, *, refit_offsets: bool = False) -> Payload:
-    """Identify the payload of an arm from a recording with it.
+    """Return the payload's ten parameters and uncertainty, from torques beyond those of the identified arm.
 
     Args:
         arm: the arm as it was identified, with another load or none.
@@ -242,7 +242,7 @@ def identify_payload(arm: KnownArm, recorded: Equations, *, refit_offsets: bool 
 
 
 def loaded_covariance(arm: KnownArm, payload: Payload) -> Array:
-    """Return the covariance of the base parameters of the arm with its payload, shape (base, base)."""
+    """Return the base parameters' covariance for the arm with its payload, infinite where unseen, (base, base)."""
     unseen = ~np.isfinite(np.diag(arm.covariance))
     M = np.eye(arm.base.size) - payload.T @ payload.G
     known = np.where(unseen[:, None] | unseen[None, :], 0.0, arm.covariance)
@@ -385,7 +385,7 @@ def _metric(covariance: Array) -> Array:
 
 
 def body_words(payload: Payload) -> tuple[str, ...]:
-    """Return a word for each of the ten values of a body: its verdict, or `chosen` where no motion shows it.
+    """Return per value of the ten of a body its verdict, or `chosen` where the motion does not determine it.
 
     A value that several base parameters make up has the worst of their verdicts.
     """
@@ -401,7 +401,7 @@ def body_words(payload: Payload) -> tuple[str, ...]:
 
 
 def center_of_mass(payload: Payload) -> tuple[Array, Array] | None:
-    """Return the centre of mass in the last link's frame and its standard deviations [m], each of shape (3,).
+    """Return centre of mass in the last link's frame and its deviations [m], (3,) each; None where not determined.
 
     Unconstrained, so that the deviations belong to it; None where mass or a first moment is not shown on its own.
     """

@@ -66,17 +66,17 @@ class Objections:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Return all of them."""
+        """Return all reasons against the estimate: those of `wrong`, then those of `little_motion`."""
         return (*self.wrong, *self.little_motion)
 
     @property
     def motion_mends(self) -> bool:
-        """Return whether another motion mends all that is objected to."""
+        """Return whether another motion is all that is needed: reasons of `little_motion`, and none of `wrong`."""
         return bool(self.little_motion) and not self.wrong
 
 
 def reasons_against(estimate: Estimate, recordings: Sequence[Recording] = ()) -> tuple[str, ...]:
-    """Return the reasons not to use an estimate, from its errors; empty where there are none.
+    """Return sentences on why an estimate cannot be right, judged by its torque errors; empty where nothing is.
 
     The words name the most likely cause where the numbers tell one.
 
@@ -100,7 +100,7 @@ def reasons_against(estimate: Estimate, recordings: Sequence[Recording] = ()) ->
 
 
 def reasons_in_length(estimate: Estimate, seconds: float) -> tuple[str, ...]:
-    """Return the reasons why a short motion tells too little, as one before a fault; empty where it tells enough.
+    """Return a sentence (or none) on why a motion under a minimum length leaves too much unidentified.
 
     A short motion that leaves much unidentified predicts itself and nothing else. Where other recordings validate the
     estimate, their errors judge it.
@@ -130,7 +130,7 @@ def reasons_in_length(estimate: Estimate, seconds: float) -> tuple[str, ...]:
 
 
 def reasons_in_recording(recording: str, joints: Sequence[JointQuality], model: ArmModel) -> tuple[str, ...]:
-    """Return the reasons why a recording cannot be of this arm in SI units; empty where there are none.
+    """Return sentences on why a recording cannot be of this arm in SI units; empty where nothing speaks against it.
 
     Args:
         recording: name of the recording, for the words.
@@ -147,17 +147,17 @@ def reasons_in_recording(recording: str, joints: Sequence[JointQuality], model: 
 
 
 def torque_missing(seen: JointQuality) -> bool:
-    """Return whether a joint's torque never changes although it moves: what was recorded is not its torque."""
+    """Return whether a joint's torque never changes although the joint moves, so that it was not recorded."""
     return seen.torque[0] == seen.torque[1] and seen.standstill < _AT_REST
 
 
 def wrapped(seen: JointQuality) -> bool:
-    """Return whether the largest step of a revolute joint is a whole turn, which no arm moves between two samples."""
+    """Return whether a joint's largest step is about one whole turn beside small ones: angles wrapped around."""
     return abs(seen.largest_step - _TURN) < _ABOUT_A_TURN and seen.usual_step < _USUAL_OF_A_TURN * _TURN
 
 
 def torque_clipped(estimate: Estimate, recordings: Sequence[Sequence[JointQuality]]) -> tuple[str, ...]:
-    """Return the reasons why torques must have been cut off at a value: they stay there, and the model misses them.
+    """Return a sentence per joint whose recorded torque stays at an extreme that the model misses: cut off there.
 
     Of a drive that gives its largest torque, what is recorded is its torque, and the model predicts it.
 
@@ -180,7 +180,7 @@ def torque_clipped(estimate: Estimate, recordings: Sequence[Sequence[JointQualit
 
 
 def remarks_on_limits(recording: str, joints: Sequence[JointQuality], model: ArmModel) -> tuple[str, ...]:
-    """Return remarks on joints that leave their position limits by less than what makes a recording unusable.
+    """Return a remark per joint that leaves its position limits a little, by less than makes a recording unusable.
 
     Args:
         recording: name of the recording, for the words.

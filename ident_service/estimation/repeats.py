@@ -51,7 +51,7 @@ class Stretches:
     recording: int = 0
 
     def label(self, number: int) -> Label:
-        """Return the label of a stretch; one of its own where nothing is known to repeat."""
+        """Return the label of the stretch with this number, equal for repeats of a motion; a unique one if unknown."""
         place = number - self.first
         return self.labels[place] if 0 <= place < len(self.labels) else (self.recording, number)
 
@@ -102,7 +102,7 @@ def stretches(
     *,
     phases: int = 12,
 ) -> tuple[Stretches, ...]:
-    """Cut recordings into stretches of time that have the same label where they show the same motion.
+    """Divide each recording into stretches of time, labelled alike where they show the same motion.
 
     Args:
         recordings: of one arm.

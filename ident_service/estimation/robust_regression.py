@@ -52,10 +52,10 @@ def huber(
     shares: Array | None = None,
     spread: SpreadRows | None = None,
 ) -> tuple[LeastSquares, Equations, float]:
-    """Return Huber's estimate, the reweighted equations that it solves, and the last round's change of it.
+    """Return Huber's estimate, the reweighted equations that it solves, and how much its last round changed it.
 
-    Where the weights do not settle in the rounds that there are, the one that changed least is the answer: a change
-    above `SETTLED` says so.
+    The change is in standard deviations. Where the weights do not settle in the rounds that there are, the one that
+    changed least is the answer: a change above `SETTLED` says so.
 
     Args:
         recordings: to fit to; each is read twice.
@@ -85,7 +85,7 @@ def huber(
 
 
 def held_out_errors(spread: SpreadRows, start: LeastSquares) -> dict[str, float]:
-    """Return the torque errors of each third, predicted from the other two, with and without Huber's weights.
+    """Return the torque error [percent] of `wls` and `huber` on each third predicted from the others, by name.
 
     Args:
         spread: rows of the recordings that are fitted to.
@@ -120,7 +120,7 @@ class SpreadRows:
     tables: tuple[Array, ...]
 
     def huber(self, beta: Array, rounds: int) -> tuple[Array, float]:
-        """Reweight for `rounds` rounds; return the estimate that changed least, and its change in white deviations."""
+        """Reweight for up to `rounds` rounds; return the estimate that changed least, and its change in deviations."""
         best = (beta, np.inf)
         for _ in range(rounds):
             better, deviations = self._reweighted(beta).estimate()
@@ -133,7 +133,7 @@ class SpreadRows:
         return best
 
     def moments(self) -> Moments:
-        """Return the products of the rows, each counted once."""
+        """Return the products of the rows' columns, without Huber's weights."""
         return self._of([table.T @ table for table in self.tables])
 
     def squared_residuals(self, beta: Array) -> Array:
@@ -141,11 +141,11 @@ class SpreadRows:
         return np.array([float(one @ one) for one in self.residuals(beta)])
 
     def only(self, part: int) -> SpreadRows:
-        """Return one third of the rows."""
+        """Return the rows of the third with number `part`, from 0."""
         return self._with([np.array_split(table, _FOLDS)[part] for table in self.tables])
 
     def without(self, part: int) -> SpreadRows:
-        """Return the other two thirds of the rows."""
+        """Return the rows of the thirds other than number `part`, from 0."""
         return self._with(
             [
                 np.concatenate([one for number, one in enumerate(np.array_split(table, _FOLDS)) if number != part])
@@ -154,12 +154,12 @@ class SpreadRows:
         )
 
     def residuals(self, beta: Array) -> list[Array]:
-        """Return the residuals of each joint's rows [N m or N]."""
+        """Return measured less predicted torque of each joint's rows [N m or N], one array per joint."""
         pairs = zip(self.tables, self.supports, strict=True)
         return [table[:, -1] - table[:, :-1] @ beta[support] for table, support in pairs]
 
     def scales(self, beta: Array) -> Array:
-        """Return the robust standard deviation of each joint's residuals [N m or N], shape (joints,)."""
+        """Return the robust standard deviation of each joint's residuals [N m or N], from medians, shape (joints,)."""
         return np.array([max(_CONSISTENT * float(np.median(np.abs(one))), 1e-9) for one in self.residuals(beta)])
 
     def _reweighted(self, beta: Array) -> Moments:
@@ -181,7 +181,7 @@ class SpreadRows:
 def spread_rows(
     recordings: Sequence[Recording], model: ArmModel, base: BaseParameters, times: Array, shares: Array
 ) -> SpreadRows:
-    """Read every recording once and return its rows; of long ones every second, every fourth ... sample is kept.
+    """Read every recording once; return its rows, torques times `times`; of long ones every 2nd, 4th ... sample.
 
     Raises:
         RecordingError: a recording cannot be used.
@@ -215,7 +215,7 @@ _MOST_WEIGHINGS = 100
 
 
 def standstill_weights(gathered: Equations) -> Array:
-    """Return the factors of the rows near standstill, shape (joints,), at most one.
+    """Return factors, at most 1, that make rows near standstill err no more than rows in motion, shape (joints,).
 
     Args:
         gathered: equations with their rows near standstill apart.

@@ -50,7 +50,7 @@ class ShapeUncertainty:
     known_degrees: Array
 
     def joined(self, deviations: Array, degrees: Array) -> tuple[Array, Array]:
-        """Return deviations with the doubt about the shape, and the degrees of freedom of both together.
+        """Return deviations widened by the friction shape's uncertainty, and the degrees of freedom of both together.
 
         Each part is widened for its own degrees of freedom, none of which is more than the deviations have: beyond
         first order, and over longer blocks, a shape is not known better than what it goes with. Together they have
@@ -80,7 +80,7 @@ def shape_uncertainty(
     torque_scales: Array,
     shares: Array,
 ) -> ShapeUncertainty:
-    """Return what the doubt about the friction's shape adds to the uncertainty of base parameters.
+    """Return the covariance that the uncertainty of the fitted friction shape adds to that of base parameters.
 
     Args:
         recordings: recordings that shape and base parameters were fitted to.

@@ -83,7 +83,7 @@ def smoothed(
     coupling: Array | None = None,
     fmt: RecordingFormat | None = None,
 ) -> Iterator[Motion]:
-    """Yield smoothed samples of a recording, block by block, without the edges of every stretch without a gap.
+    """Yield smoothed position, velocity, acceleration and torque in blocks, without the edges of each stretch.
 
     Args:
         recording: to read.
@@ -111,7 +111,7 @@ def windows(
     fmt: RecordingFormat | None = None,
     extra_margin: float = 0.0,
 ) -> Iterator[Window]:
-    """Yield smoothed samples in windows that overlap by the filter's memory and `extra_margin` [s] on both sides.
+    """Yield smoothed samples in windows that overlap by the filter's memory plus `extra_margin` [s] on both sides.
 
     Raises:
         RecordingError: as for `smoothed`.
@@ -340,7 +340,7 @@ def averaged(
     coupling: Array | None = None,
     fmt: RecordingFormat | None = None,
 ) -> Averaged:
-    """Average a recording over its periods, in memory for one period.
+    """Return the mean period of a periodic recording, smoothed; raises RecordingError if it does not repeat.
 
     Args:
         recording: recording of a periodic motion; whatever is not periodic (approach, return) is trimmed by `fmt`.

@@ -52,7 +52,7 @@ class Spectrum:
 
     @property
     def cutoff(self) -> float:
-        """Return the cut-off [Hz] of a filter that passes the motion and stops the noise."""
+        """Return the cut-off [Hz] between the end of the motion's spectrum and the beginning of noise."""
         wanted = max(_MARGIN * self.motion, USUAL)
         return min(wanted, max(self.noise, _LEAST_MARGIN * self.motion), _HIGHEST * self.rate)
 
@@ -60,7 +60,7 @@ class Spectrum:
 def with_filter(
     recordings: Sequence[Recording], options: Identification, fmt: RecordingFormat | None = None
 ) -> Identification:
-    """Return the options with the filter's free settings chosen; the cut-off is the largest that a recording needs.
+    """Return the options with `choose` of cut-off, decimation and edge replaced, from the recordings' spectra.
 
     Args:
         recordings: read once where there is something to choose.
@@ -85,7 +85,7 @@ def with_filter(
 
 
 def with_chosen_cutoff(model: ArmModel, recordings: Sequence[Recording]) -> ArmModel:
-    """Return the arm with its filter's free settings chosen from the recordings.
+    """Return the arm with the filter settings left to `choose` replaced, from the recordings' spectra.
 
     Raises:
         RecordingError: a recording cannot be read.
@@ -94,7 +94,7 @@ def with_chosen_cutoff(model: ArmModel, recordings: Sequence[Recording]) -> ArmM
 
 
 def remarks_on_noise(recordings: Sequence[Recording], model: ArmModel) -> tuple[str, ...]:
-    """Say of which recordings the filter passes noise of the positions that biases least squares.
+    """Return a remark per recording in which position noise passes the filter and biases least squares.
 
     Args:
         recordings: fitted recordings.
@@ -120,7 +120,7 @@ def remarks_on_noise(recordings: Sequence[Recording], model: ArmModel) -> tuple[
 
 
 def spectrum(recording: Recording, fmt: RecordingFormat, *, measured: bool = False) -> Spectrum:
-    """Return where motion ends and noise begins in the spectra of a recording's positions, in windows of about 20 s.
+    """Return the frequencies [Hz] where motion ends and noise begins in a recording's positions, kept for reuse.
 
     A recording that has a memory keeps it: the choice of the filter and remarks on noise ask for the same.
 

@@ -39,7 +39,7 @@ class Target:
     parameters: tuple[str, ...] = ()
 
     def places(self, base: BaseParameters, arm: str) -> NDArray[np.intp]:
-        """Return the indices of the chosen base parameters, shape (chosen,).
+        """Return the indices of the base parameters that the target names, all if it names none, shape (chosen,).
 
         Raises:
             UsageError: one is none of the arm's.
@@ -54,7 +54,7 @@ class Target:
 
 
 def worst_share(doubt: ParameterUncertainty, places: NDArray[np.intp]) -> float:
-    """Return the largest relative deviation of the chosen parameters; infinite before there are enough blocks."""
+    """Return the largest relative deviation of the chosen parameters; infinite while blocks are under 10."""
     if doubt.blocks < LEAST_BLOCKS:
         return np.inf
     worst = float(relative_deviations(doubt.beta, doubt.deviations, doubt.negligible)[places].max())

@@ -86,11 +86,11 @@ class TorqueConstants:
     applied: Array
 
     def of(self, model: ArmModel) -> ArmModel:
-        """Return an arm's model whose recorded torques are multiplied by these factors."""
+        """Return a model of the arm that multiplies recorded motor torques by these factors."""
         return model.with_options(torque_factors=tuple((self.applied * self.factors).tolist()))
 
     def uncertainty(self) -> ShapeUncertainty:
-        """Return what the factors' uncertainty adds to that of parameters that take them for known."""
+        """Return the covariance that the factors' uncertainty adds to base parameters that take them for known."""
         added = self.follow @ self.covariance @ self.follow.T
         shown = np.isfinite(self.deviations)
         degrees = np.full(len(added), np.min(self.degrees[shown], initial=np.inf))
@@ -101,7 +101,7 @@ class TorqueConstants:
 def identify_torque_constants(
     recordings: Sequence[Recording], model: ArmModel, base: BaseParameters, conditions: FeasibleSet | None
 ) -> TorqueConstants:
-    """Identify the torque constants of an arm's motors jointly with its base parameters.
+    """Fit a torque factor per motor together with base parameters, from a known payload; raises UsageError without.
 
     Args:
         recordings: recordings with the payloads that they carry (`CachedRecording.payload`), one at least.
@@ -141,7 +141,7 @@ def identify_torque_constants(
 
 
 def require_known_load(recordings: Sequence[Recording], model: ArmModel) -> None:
-    """Refuse recordings of which none has a known payload, and an arm whose description bounds its torque constants.
+    """Raise UsageError unless a recording has a known payload and no bounds on torque constants are described.
 
     Raises:
         UsageError: says what to do.

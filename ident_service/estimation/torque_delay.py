@@ -50,12 +50,12 @@ class Delay:
 
 
 def with_delay(model: ArmModel, seconds: float) -> ArmModel:
-    """Return the arm with its recordings' torque taken to be stamped `seconds` [s] too late."""
+    """Return the model with `seconds` as its delay: recorded torque is taken to be stamped that much too late."""
     return model.with_options(delay=seconds)
 
 
 def estimate_delay(recordings: Sequence[Recording], model: ArmModel, base: BaseParameters) -> Delay:
-    """Estimate one delay for recordings of the same kind.
+    """Return the delay of torque behind position [s] and its deviation, one for all recordings.
 
     Args:
         recordings: of one arm through one chain of measurement.
@@ -90,7 +90,7 @@ def estimate_delay(recordings: Sequence[Recording], model: ArmModel, base: BaseP
 def choose_delay(
     trials_at: Callable[[float], FrictionTrials], period: float, base: BaseParameters, conditions: FeasibleSet
 ) -> tuple[float, Choice | None]:
-    """Choose a delay that is common to all joints; zero unless a delay is clearly better.
+    """Return the delay [s] with the smallest held-out error, 0.0 unless one is clearly better; and how it was chosen.
 
     It is searched for within a few samples, and further on about the largest of them while that one is clearly better.
 

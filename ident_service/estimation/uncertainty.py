@@ -71,7 +71,7 @@ class Uncertainty:
 
 @one_blas_thread()
 def uncertainty(equations: Equations, fit: LeastSquares) -> Uncertainty:
-    """Estimate covariance, standard deviations and degrees of freedom from blocks.
+    """Return covariance, deviations and degrees of freedom of an estimate, from leaving out blocks of time.
 
     Args:
         equations: equations in blocks.
@@ -144,7 +144,7 @@ def _inflation(seen: Sequence[_Whitened], variance: float) -> float:
 def jackknife(
     clusters: Sequence[Sequence[Information]], fit: LeastSquares, along: Array | None = None
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Estimate a covariance by leaving out one cluster after the other (HC3).
+    """Return covariance, degrees of freedom and a mask of the unseen, leaving out one cluster at a time (HC3).
 
     Args:
         clusters: clusters of blocks; each cluster counts as one piece of evidence.
@@ -253,7 +253,7 @@ def _noise(clusters: Sequence[Sequence[Information]], fit: LeastSquares) -> Arra
 
 
 def widening(degrees: Array) -> Array:
-    """Return the factors of standard deviations that make 1.96 of them the 95 % of Student's t, shape (base,).
+    """Return the factor per parameter by which 1.96 deviations become 95 % of Student's t, shape (base,).
 
     Args:
         degrees: degrees of freedom, shape (base,).
@@ -279,12 +279,12 @@ def _degrees(lengths: Array, images: Array) -> Array:
 
 
 def block_covariance(equations: Equations, fit: LeastSquares) -> Array:
-    """Return the covariance alone, shape (base, base), see `Uncertainty`."""
+    """Return the covariance of an estimate from blocks of time, shape (base, base); infinite where unseen."""
     return uncertainty(equations, fit).covariance
 
 
 def negligible(information: Information) -> Array:
-    """Return the sizes below which parameters are as good as zero on a motion, shape (base,), SI units.
+    """Return the size [SI] below which each parameter makes under a tenth of every joint's torque, shape (base,).
 
     A parameter of this size makes a tenth of the torque of some joint that feels it, and no more of any other's. So a
     deviation of a tenth of it, with which it is called identified, is a hundredth of the joint's torque.
@@ -299,7 +299,9 @@ def negligible(information: Information) -> Array:
 
 
 def verdicts(beta: Array, deviations: Array, as_zero: Array) -> tuple[Verdict, ...]:
-    """Return a verdict per parameter: its deviation against the larger of its size and what is as good as zero.
+    """Return per parameter `identified`, `weak` or `unidentified`, by its deviation relative to its size.
+
+    Its size counts as at least what is as good as zero.
 
     Args:
         beta: parameters, shape (base,).
@@ -313,7 +315,7 @@ def verdicts(beta: Array, deviations: Array, as_zero: Array) -> tuple[Verdict, .
 
 
 def relative_deviations(beta: Array, deviations: Array, as_zero: Array) -> Array:
-    """Return each deviation as a share of the larger of the parameter's size and what is as good as zero."""
+    """Return each deviation over the larger of the parameter's magnitude and `as_zero`; infinite where unseen."""
     sizes = np.maximum(np.maximum(np.abs(beta), as_zero), np.finfo(float).tiny)
     # Parameters that no joint feels have infinite negligible sizes.
     return np.where(np.isfinite(deviations), deviations, np.inf) / np.where(np.isfinite(sizes), sizes, 1.0)

@@ -56,7 +56,7 @@ class ActiveLimit:
 
 
 def binding(task: Task, coefficients: Array, per_period: int) -> tuple[ActiveLimit, ...]:
-    """Return the limits that constrain a motion, the costliest first.
+    """Return the limits that a motion reaches, each with what relaxing it would gain; the largest gain first.
 
     Args:
         task: task of the search.
@@ -98,7 +98,7 @@ def binding(task: Task, coefficients: Array, per_period: int) -> tuple[ActiveLim
 
 
 def needed_stiffness(task: Task, coefficients: Array, per_period: int) -> Array:
-    """Return how many times as stiff each joint has to be to follow at its velocity limit, shape (joints,).
+    """Return needed over present stiffness of each joint, to follow at its velocity limit, shape (joints,).
 
     Args:
         task: task of the search.
@@ -117,7 +117,7 @@ def active_limit_lines(
     lengths: Sequence[str],
     gains: Mapping[int, str] | None = None,
 ) -> list[str]:
-    """Say what holds a motion back, what it costs, and which gains would lift it.
+    """Return lines for people: which limits hold a motion back, what they cost, and which gains would lift them.
 
     Args:
         found: the limits.
@@ -160,7 +160,7 @@ def stiffer_gains(
     limits: MotionLimits,
     stable: Callable[[Array, Array], bool],
 ) -> dict[int, str]:
-    """Propose gains for the joints that following holds back, in words by joint; all of them together are stable.
+    """Return sentences, by joint index, on stiffer kp and kd where following holds back, stable all together.
 
     Args:
         found: the limits.
@@ -198,7 +198,7 @@ def stiffer_gains(
 
 
 def gain_words(criterion: Criterion, factor: float) -> str:
-    """Say what a factor of a criterion's gain means for the estimate."""
+    """Return words for a factor of a criterion's gain: more information, smaller variances or condition number."""
     if criterion == "d_optimal":
         more = f"{factor:.2g} times the" if factor >= _MUCH else f"{factor - 1.0:.0%} more"
         return f"{more} information per parameter"

@@ -51,7 +51,7 @@ _RESERVE = 0.9  # of the room between clearance and torque limits that the postu
 
 
 def safe_posture(model: ArmModel, limits: MotionLimits, seed: int = 0, extra_clearance: float = 0.0) -> Array:
-    """Return the posture nearest to home that leaves the motion room, shape (joints,).
+    """Return the tried posture nearest to home that leaves room for a motion, shape (joints,); raises if none.
 
     Args:
         model: model whose prior gives the gravity torque.
@@ -180,7 +180,7 @@ class Prover:
         self._limits, self._collision = motion_limits(model.config), CollisionModel(model)
 
     def proof(self, coefficients: Array) -> tuple[Proof, str]:
-        """Return the proof of a motion, and what speaks against the motion in words, empty where nothing does."""
+        """Return the proof of a motion's bounds, and what speaks against the motion in words; "" where nothing does."""
         path, limits = self._task.basis.path(coefficients), self._task.limits
         proof = proof_of(path, self._model, limits, self._collision, self._margin)
         why = "; ".join(violations(proof, self._model, limits))
@@ -195,7 +195,7 @@ class Prover:
         best: Attempt | None = None,
         task: Task | None = None,
     ) -> Attempt | None:
-        """Prove the most promising candidates, searched on or made smaller where a proof objects; return the best.
+        """Prove candidates, best first, searched on or shrunk where a proof fails; return the best attempt or None.
 
         Args:
             candidates: candidates of the search. Their values are of a smoothed criterion; the exact one, used here,
@@ -226,12 +226,12 @@ class Prover:
         return best
 
     def aimed(self, candidate: Candidate) -> Task:
-        """Return the task with as much kept free as the proof of a first motion finds to be missing."""
+        """Return the task made harder by what the candidate's proof lacks at full size; else the task itself."""
         first = self._at_full_size(self._task, candidate)
         return (self._harder(first) if first.why else None) or self._task
 
     def safe(self, task: Task) -> Array:
-        """Return a posture that keeps the limits of a task, shape (joints,)."""
+        """Return a posture that keeps the task's limits and clearance, shape (joints,); raises if none is found."""
         if task.extra_clearance == self._task.extra_clearance:
             return self._safe
         return safe_posture(self._model, task.limits, extra_clearance=task.extra_clearance)
@@ -325,7 +325,7 @@ class Designed:
 
 
 def family(design: Design, model: ArmModel) -> tuple[Basis, BaseParameters]:
-    """Return the family of motions that a design asks for, and the base parameters that it can identify."""
+    """Return the motion family (Fourier or postures) of a design, and the base parameters that it can identify."""
     if design.motion == "fourier":
         basis = FourierBasis(design.base_frequency, design.harmonics, design.periods, design.ramp)
         return basis, base_parameters(model.chain, model.layout)
@@ -342,7 +342,7 @@ def complete_task(
     noise: Array | None = None,
     added: Array | None = None,
 ) -> Task:
-    """Return the search task of a design, with all limits and weights checked.
+    """Build the search task of a design, with limits less margins; raises where limits or parameters do not fit.
 
     Args:
         model: of the arm.
@@ -572,7 +572,7 @@ def _scaling_text(task: Task, base: BaseParameters, attempt: Attempt) -> str:
 
 
 def require_known_inertia(model: ArmModel, task: Task, safe: Array) -> None:
-    """Refuse an arm whose controller is far too soft because its drives' inertia is not described.
+    """Raise MotionRefused where a joint without described drive inertia would lag far at its velocity limit.
 
     The law's stiffness is kp times the inertia that it knows, behind a wrist next to none; and the arm itself, which
     has more, is simulated with as little. What such a motion comes to is chance.
@@ -604,7 +604,7 @@ def require_known_inertia(model: ArmModel, task: Task, safe: Array) -> None:
 
 
 def require_storable(basis: Basis) -> None:
-    """Refuse a family of motions longer than a file may hold.
+    """Raise UsageError if a motion of this family is longer than a day.
 
     Raises:
         UsageError: longer than a day.
@@ -617,14 +617,14 @@ def require_storable(basis: Basis) -> None:
 
 
 def per_period(basis: Basis) -> int:
-    """Return the number of samples at which a search checks a motion, per period or per whole motion."""
+    """Return the number of samples at which a search checks a motion, per period (Fourier) or whole motion."""
     if isinstance(basis, FourierBasis):
         return min(_MOST_SAMPLES, max(120, _PER_HARMONIC * basis.harmonics))
     return min(_MOST_SAMPLES, max(120, _PER_WAY * 2 * basis.size))
 
 
 def criterion_of(task: Task, path: FourierPath | PosturePath, base: BaseParameters) -> float:
-    """Return the criterion of a motion over its whole length, with the information that was there before."""
+    """Return the criterion's value, smaller is better, of a whole motion plus the task's earlier information."""
     G = information(path, task.model, base, task.noise) * seconds_of_information(path) * task.rate
     if task.added is not None:
         G = G + task.added

@@ -62,7 +62,7 @@ class TimeIntervals:
     crackle: Array
 
     def of(self, order: int) -> list[TaylorModel]:
-        """Return enclosures of position (order 0), velocity, acceleration or jerk (3), one per joint."""
+        """Return enclosures over each interval of position (order 0), velocity, acceleration or jerk (3), per joint."""
         h = self.half
         rest = self.crackle * (h ** (5 - order) / factorial(5 - order))[:, None]
         for i in range(2, 5 - order):
@@ -72,7 +72,7 @@ class TimeIntervals:
 
 
 def stretches(path: Path, longest: float | None = None) -> TimeIntervals:
-    """Return stretches of time that cover one instance of every distinct part of a motion.
+    """Cover each distinct part of a motion once with short time intervals, with derivatives at their middles.
 
     Args:
         path: the motion.
@@ -123,7 +123,7 @@ class PeakBounds:
     motors: Array | None = None
 
     def violations(self, names: tuple[str, ...], limits: MotionLimits, supply: Supply | None = None) -> list[str]:
-        """Return every limit that a bound exceeds, in words; empty when the arm may move so."""
+        """Return a sentence for each limit that a bound exceeds; empty where none does. NaN counts as beyond."""
         # Negated comparisons, so that a bound that is NaN counts as beyond every limit.
         found = []
         for k, name in enumerate(names):
@@ -141,7 +141,7 @@ class PeakBounds:
     def torque_and_power_violations(
         self, names: tuple[str, ...], limits: MotionLimits, supply: Supply | None = None
     ) -> list[str]:
-        """Return the violations of torque and power alone, in words."""
+        """Return a sentence for each exceeded limit of joint torque, motor torque or supply power; empty for none."""
         found = []
         if self.torque is not None:
             rows = zip(names, self.torque, limits.torque, strict=True)
@@ -155,7 +155,7 @@ class PeakBounds:
 
 
 def demands(path: Path, model: ArmModel) -> PeakBounds:
-    """Return the peak bounds of a motion, over all time.
+    """Bound position, velocity, acceleration, jerk, torque and power of a motion over all time.
 
     Args:
         path: the motion.
@@ -208,7 +208,7 @@ def demands(path: Path, model: ArmModel) -> PeakBounds:
 
 
 def torque_enclosures(cells: TimeIntervals, model: ArmModel, delta: Array) -> list[TaylorModel]:
-    """Return enclosures of every joint's torque with link parameters `delta`, shape (layout.size,), per stretch."""
+    """Return bounds of every joint's torque [N m or N] over each time interval, with link parameters `delta`."""
     tape, entries = traced_regressor(model.chain, model.layout)
     n = model.chain.joints
     torque: list[Value] = [0.0] * n
@@ -232,7 +232,7 @@ def _drive_rates(velocity: list[TaylorModel], coupling: Array) -> list[TaylorMod
 
 
 def power_bounds(torque: list[TaylorModel], velocity: list[TaylorModel], supply: Supply, coupling: Array) -> Array:
-    """Return the most power that is drawn from the supply [W], shape (stretches,), as `Supply` counts it.
+    """Return the largest power drawn from the supply [W] in each time interval, shape (stretches,).
 
     Torque and velocity of the joints are handed to the drives that move them, `tau_drive = C^-T tau`.
     """
@@ -246,7 +246,7 @@ def power_bounds(torque: list[TaylorModel], velocity: list[TaylorModel], supply:
 
 
 def require_within_limits(path: Path, model: ArmModel, limits: MotionLimits) -> PeakBounds:
-    """Return the motion's peak bounds, and refuse a motion that exceeds the limits.
+    """Return the motion's peak bounds; raise MotionRefused naming every limit that they exceed.
 
     Raises:
         MotionRefused: it asks for more than the arm may do; every violation is named.
@@ -288,12 +288,12 @@ class Clearance:
 
     @property
     def proven(self) -> bool:
-        """Return whether the required distance is proven to be kept at all times."""
+        """Return whether the proven lower bound of the distance is at least the required one."""
         return self.lower_bound >= self.required
 
 
 def certified_clearance(collision: CollisionModel, path: Path, clearance: float, tube: Tube | None = None) -> Clearance:
-    """Prove, or disprove, that a path keeps the bodies of every pair apart.
+    """Return a proven lower bound of the distance of all pairs of bodies along a path, and where it is least.
 
     Args:
         collision: the pairs.
@@ -328,7 +328,7 @@ def certified_along(
     duration: float,
     clearance: float,
 ) -> Clearance:
-    """Prove, or disprove, the clearance of any motion of bounded speed, as `certified_clearance` does for a path.
+    """Return a proven lower bound of the distance of all pairs for any motion no faster than `speed`.
 
     Args:
         collision: the pairs.
@@ -426,7 +426,7 @@ def proof_of(
     collision: CollisionModel,
     torque_margin: float | None = None,
 ) -> Proof:
-    """Bound a motion's peaks, and simulate the arm where its reference is proven to keep every limit.
+    """Bound a motion and its ways from and to home; simulate the arm too where these are proven to keep limits.
 
     Args:
         path: the motion.
@@ -467,7 +467,7 @@ def _approach_paths(path: FourierPath | PosturePath, limits: MotionLimits) -> Po
 
 
 def violations(proof: Proof, model: ArmModel, limits: MotionLimits) -> list[str]:
-    """Return every limit that is not proven to be kept, in words; empty when all are."""
+    """Return a sentence for each limit that is not proven to be kept; empty where all are."""
     found = proof.demands.violations(model.chain.names, limits, model.config.supply)
     forces = proof.ways.torque_and_power_violations(model.chain.names, limits, model.config.supply)
     found += [f"at home, or on the way from it or back: {one}" for one in forces]
@@ -484,7 +484,7 @@ def violations(proof: Proof, model: ArmModel, limits: MotionLimits) -> list[str]
 
 
 def tightened(task: Task, proof: Proof, limits: MotionLimits) -> Task | None:
-    """Return a task whose search keeps free what a proof has found to be missing; None where that would not help.
+    """Return a task that keeps free what a proof found missing; None where nothing changes or it is too much.
 
     The search forecasts friction alone. The simulated arm also has heavier links, and takes its time to settle, and the
     tube around its motion is as wide as its worst joint makes it.
@@ -516,7 +516,7 @@ def scale_to_verified(
     safe: Array,
     proven: Callable[[Array], Proof | None],
 ) -> tuple[Array, Proof] | None:
-    """Return the largest motion between standing still and the given one that can be proven to keep all limits.
+    """Return a motion's coefficients and proof if proven, else of a smaller one; None if even 1 % of it is not.
 
     Sizes are tried ever more coarsely until one can be proven, then halfway back. That takes a few proofs, of seconds
     each, where one size after another would take twenty.
@@ -526,9 +526,6 @@ def scale_to_verified(
         coefficients: of the motion, shape (joints, size).
         safe: coefficients of standing still in a posture that keeps all limits.
         proven: the proof of a motion that keeps all limits, None for one that does not.
-
-    Returns:
-        Coefficients and proof, or None where even a hundredth of the motion cannot be proven.
     """
     if (proof := proven(coefficients)) is not None:
         return coefficients, proof

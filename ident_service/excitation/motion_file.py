@@ -46,7 +46,7 @@ class Excitation:
         return self.path.duration
 
     def to_json(self) -> str:
-        """Return one small JSON object from which the motion can be repeated to the last bit."""
+        """Return a JSON text from which the motion can be repeated to the last bit."""
         head = {"format": FORMAT, "version": VERSION, "name": self.name, "arm": {"sha256": self.arm_sha256}}
         path = self.path
         if isinstance(path, FourierPath):
@@ -71,7 +71,7 @@ class Excitation:
 
 
 def read_excitation(file: FilePath) -> Excitation:
-    """Read a motion's JSON file.
+    """Read a motion from its JSON file; raises UsageError where the file is missing or holds none.
 
     Raises:
         UsageError: no such file, or not a motion; the message says what is wrong with it.
@@ -91,7 +91,7 @@ def read_excitation(file: FilePath) -> Excitation:
 
 
 def excitation_from_json(text: str) -> Excitation:
-    """Parse the text that `Excitation.to_json` made.
+    """Parse the JSON text of a motion; raises UsageError where it is none.
 
     Raises:
         UsageError: not a motion; the message says what is wrong with it.

@@ -79,7 +79,7 @@ class Task:
 
 
 def usable_limits(names: tuple[str, ...], limits: MotionLimits, design: Design) -> MotionLimits:
-    """Return the limits with the design's margins taken off.
+    """Return the limits less the design's margins of position and torque; raises if no range is left.
 
     Raises:
         MotionRefused: nothing is left of a position range.
@@ -121,7 +121,7 @@ def criterion(
     chosen: NDArray[np.intp] | None = None,
     scale: Array | None = None,
 ) -> Value:
-    """Evaluate a criterion and its gradient.
+    """Return a criterion's value (smaller is better) and its gradient over the information matrix G.
 
     Args:
         kind: kind of criterion.
@@ -151,7 +151,7 @@ def criterion(
 
 
 def condition_number(G: Array) -> float:
-    """Return the condition number of the stacked regressor with information G; infinite where G is singular."""
+    """Return the condition number, the root of G's eigenvalue ratio; infinite where G is singular."""
     eigenvalues = np.linalg.eigvalsh(G)
     return float(np.sqrt(eigenvalues[-1] / eigenvalues[0])) if eigenvalues[0] > 0.0 else float("inf")
 
@@ -177,7 +177,7 @@ class Multipliers:
     weight: float
 
     def tightened(self, found: Limits, factor: float) -> Multipliers:
-        """Return the next state after a minimisation that ended with `found`."""
+        """Return the updated multipliers, and the weight times `factor`, after a minimisation that ended at `found`."""
         values = {name: np.maximum(0.0, self.values[name] + self.weight * c) for name, c in found.items()}
         return Multipliers(values, self.weight * factor)
 
@@ -198,7 +198,7 @@ class State:
 
     @property
     def worst(self) -> float:
-        """Return the largest share by which a limit is exceeded; not positive where all are kept."""
+        """Return the largest relative excess over a limit, 0.1 for 10 % above; not positive where all are kept."""
         return max(float(values.max()) for values in self.limits.values() if values.size)
 
 
@@ -277,21 +277,21 @@ class Problem:
         return self._scale.size
 
     def coefficients(self, x: Array) -> Array:
-        """Return the coefficients of the basis, shape (joints, size), of variables of shape (size,)."""
+        """Return the motion's coefficients, shape (joints, size), from the search variables, shape (size,)."""
         return np.asarray(self._offset + x.reshape(self._scale.shape) * self._scale)
 
     def variables(self, coefficients: Array) -> Array:
-        """Return the variables of coefficients, the inverse of `coefficients`."""
+        """Return the search variables of a motion's coefficients, the inverse of `coefficients`."""
         return np.asarray(((coefficients - self._offset) / self._scale).ravel())
 
     def no_multipliers(self, weight: float) -> Multipliers:
-        """Return the initial state of an augmented Lagrangian, all multipliers zero."""
+        """Return multipliers that are all zero, with this penalty weight."""
         samples = len(self._weights)
         shapes = {"power": (samples, 1), "clearance": (samples + _LINE, len(self._capsules.pairs))}
         return Multipliers({name: np.zeros(shapes.get(name, (samples, self._n))) for name in self.names}, weight)
 
     def linear_peaks(self, x: Array, share: float) -> set[Peak]:
-        """Return the local peaks, above a share, of the limits that are linear in x, and their neighbours.
+        """Return local peaks above a share of limits linear in x, with neighbours: (kind, sample, joint, upper side).
 
         Args:
             x: variables, shape (size,).
@@ -327,10 +327,7 @@ class Problem:
         return tuple(zip(self._maps, middles, sizes, strict=True))
 
     def speed_from_error(self, x: Array) -> Array:
-        """Return which share of its allowed speed the arm needs to fall behind and catch up, shape (samples, joints).
-
-        It is positive where that comes on top of the reference's speed, negative where it takes some off.
-        """
+        """Return the share of its allowed speed that catching up adds, negative if it takes off, (samples, joints)."""
         q, dq = (values @ self.coefficients(x).T for values in self._maps[:2])
         if self._following is None:
             return np.zeros_like(q)
@@ -338,7 +335,10 @@ class Problem:
         return np.asarray(catching_up * np.sign(dq + catching_up) / (TOLERATED * self.task.limits.velocity))
 
     def error_at_velocity_limit(self, x: Array) -> Array:
-        """Return the largest forecast error in the motion's postures at the velocity limits [rad or m], (joints,)."""
+        """Return the largest predicted following error at the velocity limits [rad or m], shape (joints,).
+
+        It is taken in all postures of the motion.
+        """
         q, dq = (values @ self.coefficients(x).T for values in self._maps[:2])
         if self._following is None:
             return np.zeros(self._n)
@@ -346,7 +346,7 @@ class Problem:
         return np.asarray(np.abs(self._following.run(q, fastest)).max(axis=0))
 
     def state(self, x: Array, sharpness: float) -> State:
-        """Return criterion and limits at x."""
+        """Return the criterion's value and how far each limit is exceeded at x."""
         return self._evaluate(x, sharpness, None)[0]
 
     def value_and_gradient(self, x: Array, sharpness: float, multipliers: Multipliers) -> tuple[float, Array]:

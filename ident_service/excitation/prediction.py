@@ -63,7 +63,7 @@ class InertiaResponse:
         self._position = self._M = self._response = np.zeros((0, n))
 
     def run(self, position: Array, torque: Array) -> Array:
-        """Return the accelerations [rad/s^2 or m/s^2], shape (samples, joints).
+        """Return the joint accelerations that torques alone cause [rad/s^2 or m/s^2], shape (samples, joints).
 
         Args:
             position: [rad or m], shape (samples, joints).
@@ -78,7 +78,7 @@ class InertiaResponse:
         return self._response
 
     def pull(self, seeds: Array) -> tuple[Array, Array]:
-        """Return the gradient of `sum(seeds * run(...))` at the last run's states.
+        """Return the gradient of `sum(seeds * run(...))` over position and torque, each of shape (samples, joints).
 
         Args:
             seeds: shape (samples, joints).
@@ -117,7 +117,7 @@ class NoiseModel:
 
 
 def described_noise(model: ArmModel, limits: MotionLimits) -> NoiseModel:
-    """Return the noise of the arm's description: the simulated driver's, else one hundredth of the torque limits."""
+    """Return each joint's torque noise: the simulated driver's where given, else 1 % of the torque limits."""
     driver = model.config.driver
     fallback = _NOISE_SHARE * limits.torque
     if isinstance(driver, SimulatedDriver):
@@ -128,7 +128,7 @@ def described_noise(model: ArmModel, limits: MotionLimits) -> NoiseModel:
 
 
 def information(path: FourierPath | PosturePath, model: ArmModel, base: BaseParameters, noise: Array) -> Array:
-    """Return the information per second of a motion, its ramps left out, shape (base, base).
+    """Return the information matrix per sample of a motion without its ramps, shape (base, base).
 
     Args:
         path: the motion.
@@ -144,7 +144,7 @@ def information(path: FourierPath | PosturePath, model: ArmModel, base: BasePara
 
 
 def seconds_of_information(path: FourierPath | PosturePath) -> float:
-    """Return the time for which `information` holds [s]; ramps count for nothing."""
+    """Return the time that `information` counts for [s]: all periods, or the whole motion through postures."""
     return path.periods * path.series.period if isinstance(path, FourierPath) else path.duration
 
 
@@ -197,7 +197,7 @@ def dry_friction(model: ArmModel, delta: Array) -> tuple[Array, Array]:
 
 
 def unknown_friction(friction: ExpectedFriction, share: float) -> ExpectedFriction:
-    """Return the most of the expected friction that a feed-forward of `share` leaves, either way, within `DOUBT`."""
+    """Return the largest friction that a feed-forward of `share` may leave uncompensated, offset zero."""
     left = max(DOUBT[1] - share, share - DOUBT[0])
     return ExpectedFriction(left * friction.coulomb, left * friction.viscous, 0.0 * friction.offset)
 
@@ -225,7 +225,7 @@ class FollowingError:
         self._slope = np.zeros((0, len(creep)))
 
     def run(self, position: Array, velocity: Array) -> Array:
-        """Return the predicted error [rad or m], shape (samples, joints), at states of shape (samples, joints)."""
+        """Return the predicted following error [rad or m] from uncompensated friction, shape (samples, joints)."""
         rate = velocity @ self._coupling.T
         turned = np.tanh(rate / self._creep)
         self._slope = self._friction.viscous + self._friction.coulomb * (1.0 - turned**2) / self._creep
@@ -239,7 +239,7 @@ class FollowingError:
 
 
 def rate_of_change(times: Array) -> scipy.sparse.csr_array:
-    """Return the matrix that takes values at `times` [s] to time derivatives, by differences of neighbours.
+    """Return the sparse matrix that maps values at `times` [s] to their time derivatives, by differences.
 
     Neighbours are samples of one stretch; where times jump or turn back, another stretch begins.
     """

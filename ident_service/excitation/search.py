@@ -73,7 +73,7 @@ class Candidate:
 
 
 def random_variables(problem: Problem, rng: np.random.Generator, safe: Array) -> Array:
-    """Return the variables of a random motion about a posture between the safe one and a random one.
+    """Return search variables of a random motion about a posture between the safe one and a random one.
 
     Args:
         problem: of the search.
@@ -93,7 +93,7 @@ def random_variables(problem: Problem, rng: np.random.Generator, safe: Array) ->
 def local_search(
     problem: Problem, x: Array, safe: Array, start: int, check: Callable[[], None], *, polish: bool = False
 ) -> Candidate:
-    """Improve a motion by local search, and return the best candidate that keeps all limits at the samples.
+    """Improve a motion by local search; return the best candidate that keeps all limits at the samples.
 
     Args:
         problem: of the search.
@@ -102,9 +102,6 @@ def local_search(
         start: number of the random start.
         check: called at every evaluation; what it raises ends the rounds.
         polish: True for a motion that is good already.
-
-    Returns:
-        The best motion found.
 
     Raises:
         InterruptedWithResult: `check` raised Interrupted; with the best of what the rounds had found until then.
@@ -210,7 +207,7 @@ class InterruptedWithResult(Interrupted):
 
 
 def best_feasible(problem: Problem, x: Array, safe: Array, start: int) -> Candidate:
-    """Return the best motion between x and standing still that keeps all limits at the samples.
+    """Return the best of the motions between x and standing still that keep all limits at the samples.
 
     Standing still means in the motion's own middle, where that keeps the limits, or in the safe posture.
     """
@@ -324,7 +321,7 @@ def search(
     cancelled: Callable[[], bool] = lambda: False,
     earlier: SearchResult | None = None,
 ) -> SearchResult:
-    """Search for the best motion until the budget is used up, or the search is cancelled.
+    """Search from random starts until the budget is used or `cancelled`; return the best candidates, at least one.
 
     Args:
         task: task of the search.
@@ -357,7 +354,7 @@ def search(
 def polished(
     task: Task, coefficients: Array, safe: Array, start: int, per_period: int, stopped: Callable[[], bool]
 ) -> Candidate:
-    """Polish a motion for another task than that which it was found for, in this process.
+    """Improve a motion for another task by local search; return the best that keeps its limits at the samples.
 
     Args:
         task: new task.
@@ -599,7 +596,7 @@ _MOST_BYTES = 16 * 2**20
 
 
 def fingerprint(task: Task, seed: int) -> str:
-    """Return the SHA-256 of everything that a search's random starts and its criterion depend on."""
+    """Return the SHA-256 (hex) of all that a search's starts and criterion depend on, to recognise the same search."""
     digest = hashlib.sha256()
     parts = (
         task.model.config.motion_sha256,
@@ -617,7 +614,7 @@ def fingerprint(task: Task, seed: int) -> str:
 
 
 def found_to_json(found: SearchResult, task: Task) -> str:
-    """Return the results of a search as one JSON object."""
+    """Return a search's candidates and state as one JSON text, for `read_found`."""
     return json.dumps(
         {
             "format": FORMAT,
@@ -638,7 +635,7 @@ def found_to_json(found: SearchResult, task: Task) -> str:
 
 
 def read_found(file: Path, task: Task, seed: int) -> SearchResult:
-    """Read a search that is to be resumed.
+    """Read a search to resume from its JSON file; raises UsageError unless task and seed are the same.
 
     Args:
         file: file that `found_to_json` made.

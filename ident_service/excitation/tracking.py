@@ -75,15 +75,15 @@ class Tracking:
     repeats_from: float = np.inf
 
     def late(self, limits: MotionLimits) -> NDArray[np.bool_]:
-        """Return which joints are too far from their references for the guard of an arm, shape (joints,)."""
+        """Return a mask of joints whose simulated following error exceeds 85 % of its limit, shape (joints,)."""
         return np.asarray(~(self.used(limits)[0] <= 1.0))
 
     def used(self, limits: MotionLimits) -> tuple[Array, Array]:
-        """Return the shares used of what a simulated arm may: of following errors and velocities, shape (joints,)."""
+        """Return following error over 85 % of its limit, and velocity over 110 % of its limit, shape (joints,) each."""
         return self.error / (_ERROR_USED * limits.following_error), self.velocity / (_VELOCITY_USED * limits.velocity)
 
     def objections(self, names: Sequence[str], limits: MotionLimits) -> list[str]:
-        """Return what the safety monitor would stop, or might, in words; empty when the arm can follow.
+        """Return a sentence per joint that lags, speeds or leaves its limits too far in simulation; empty if none.
 
         Args:
             names: of the joints.
@@ -123,7 +123,7 @@ class Tracking:
 
 
 def cases(margin: float) -> tuple[Case, ...]:
-    """Return the cases to simulate: less friction, and more friction with links heavier by the torque margin."""
+    """Return the two cases to simulate: less friction; more friction with links heavier by the torque margin."""
     heavier = 1.0 + margin
     down, up = DOUBT
     return (
@@ -133,7 +133,9 @@ def cases(margin: float) -> tuple[Case, ...]:
 
 
 def track(path: Path, model: ArmModel, margin: float) -> Tracking:
-    """Simulate the arm over a motion; of a periodic one, both ramps and one period, which the others repeat.
+    """Simulate the controlled arm over a motion with less and more friction; return its largest errors and speeds.
+
+    Of a periodic motion both ramps and one period are simulated, which the others repeat.
 
     Args:
         path: the motion.
@@ -172,7 +174,9 @@ def track(path: Path, model: ArmModel, margin: float) -> Tracking:
 
 
 def segment_tube_width(path: Path, model: ArmModel, margin: float) -> Callable[[Array, Array], Array]:
-    """Simulate the arm over slow segments as `track`, long ones in parts, whose largest error then counts throughout.
+    """Simulate the arm over slow segments; return the function of its largest distance from the reference.
+
+    Long segments are simulated in parts, whose largest error then counts throughout.
 
     A joint that dry friction holds moves only when the reference has left it behind by `|M^-1| f / kp`, which on a slow
     way takes longer than a part; so that is added.
@@ -183,7 +187,7 @@ def segment_tube_width(path: Path, model: ArmModel, margin: float) -> Callable[[
         margin: margin, as for `track`.
 
     Returns:
-        How far the arm may be from its reference, as `Tracking.width`.
+        A function of times and half widths [s], as `Tracking.width`.
 
     Raises:
         ModelError, MotionRefused: as `track`.

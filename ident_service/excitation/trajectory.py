@@ -94,7 +94,7 @@ class FourierSeries(_Sampled):
         return np.asarray(2.0 * np.pi * self.base_frequency * np.arange(1, self.a.shape[1] + 1))
 
     def scaled(self, factor: float) -> FourierSeries:
-        """Return the motion about the same middle with all amplitudes times `factor`."""
+        """Return a series about the same middle position with all amplitudes times `factor`."""
         return FourierSeries(self.base_frequency, self.a * factor, self.b * factor, self.q0.copy())
 
 
@@ -118,7 +118,7 @@ class Path(Protocol):
 
     @property
     def distinct(self) -> tuple[tuple[float, float], ...]:
-        """Return the stretches of time [s] that contain every distinct part; all other times repeat them."""
+        """Return (begin, end) [s] of the stretches that contain every distinct part; all other times repeat them."""
 
     @property
     def crackle(self) -> Array:
@@ -126,10 +126,10 @@ class Path(Protocol):
 
     @property
     def seams(self) -> Array:
-        """Return the times between which all derivatives are smooth [s], from 0 to the duration, increasing."""
+        """Return the times at which higher derivatives may jump [s], from 0 to the duration, increasing."""
 
     def fastest(self, begin: float, end: float) -> float:
-        """Return the highest relevant frequency between two times [Hz]."""
+        """Return the highest frequency of the motion between two times [Hz], for choosing how finely to sample."""
 
     def derivatives(self, time: Array, highest: int) -> list[Array]:
         """Return position and its time derivatives up to the order `highest` <= 4, each of shape (samples, joints)."""
@@ -172,7 +172,7 @@ class FourierPath(_Sampled):
 
     @property
     def distinct(self) -> tuple[tuple[float, float], ...]:
-        """Return the times of both ramps and of one period [s]."""
+        """Return (begin, end) [s] of the first ramp, first period and last ramp; only the period without ramps."""
         full = (self.ramp, self.ramp + self.series.period)
         if self.ramp == 0.0:
             return (full,)
@@ -180,7 +180,7 @@ class FourierPath(_Sampled):
 
     @property
     def crackle(self) -> Array:
-        """Return the bound of the fifth derivative by Leibniz' rule on window and harmonics, shape (joints,)."""
+        """Return a bound of the fifth derivative of ramp times series [rad/s^5 or m/s^5], shape (joints,)."""
         rates = 2.0 * np.pi * self.series.base_frequency * np.arange(1, self.series.a.shape[1] + 1)
         sizes = np.hypot(self.series.a, self.series.b) / rates
         swing = [(sizes * rates**order).sum(axis=1) for order in range(6)]
@@ -191,18 +191,18 @@ class FourierPath(_Sampled):
 
     @property
     def seams(self) -> Array:
-        """Return the ends of the ramps [s]."""
+        """Return the times at which ramps begin and end [s], increasing."""
         ends = [0.0, self.ramp, self.duration - self.ramp, self.duration]
         return np.array(sorted(set(ends)))
 
     def fastest(self, begin: float, end: float) -> float:
-        """Return the frequency of the highest harmonic, or the reciprocal of the ramp where that is higher [Hz]."""
+        """Return the highest harmonic's frequency [Hz]; in a ramp, the reciprocal ramp time where that is higher."""
         highest = self.series.base_frequency * self.series.a.shape[1]
         in_ramp = self.ramp > 0.0 and (begin < self.ramp or end > self.duration - self.ramp)
         return float(max(highest, 1.0 / self.ramp) if in_ramp else highest)
 
     def derivatives(self, time: Array, highest: int) -> list[Array]:
-        """Return position and its time derivatives up to the order `highest`."""
+        """Return position and its time derivatives up to the order `highest`, each of shape (samples, joints)."""
         swing = self.series.derivatives(time - self.ramp, highest)
         if self.ramp == 0.0:
             return swing
@@ -267,12 +267,12 @@ class PosturePath(_Sampled):
 
     @property
     def distinct(self) -> tuple[tuple[float, float], ...]:
-        """Return the whole motion as one stretch [s]."""
+        """Return the whole motion as one stretch, ((0, duration),) [s]."""
         return ((0.0, self.duration),)
 
     @property
     def crackle(self) -> Array:
-        """Return the bound of the fifth derivative, that of the steepest segment, shape (joints,)."""
+        """Return a bound of the fifth derivative, that of the steepest segment [rad/s^5 or m/s^5], shape (joints,)."""
         ways = np.abs(np.diff(self.points, axis=0))
         return np.asarray((ways * STEP_PEAKS[5] / self.times[:, None] ** 5).max(axis=0))
 
@@ -282,11 +282,11 @@ class PosturePath(_Sampled):
         return np.unique(np.concatenate([[0.0], self._begins[:-1], self._begins[:-1] + self.times, [self.duration]]))
 
     def fastest(self, begin: float, end: float) -> float:
-        """Return the reciprocal duration of the shortest segment [Hz]."""
+        """Return the reciprocal duration of the shortest of all segments [Hz], whatever the two times are."""
         return float(1.0 / self.times.min())
 
     def derivatives(self, time: Array, highest: int) -> list[Array]:
-        """Return position and its time derivatives up to the order `highest`."""
+        """Return position and its time derivatives up to the order `highest`, each of shape (samples, joints)."""
         way = np.clip(np.searchsorted(self._begins, time, side="right") - 1, 0, len(self.times) - 1)
         length = self.times[way]
         share = (time - self._begins[way]) / length
@@ -312,7 +312,7 @@ class Basis(Protocol):
 
     @property
     def moving(self) -> NDArray[np.bool_]:
-        """Return which coefficients move the arm away from standing still, shape (size,)."""
+        """Return a mask of the coefficients that can make the arm move; others only set its place; (size,)."""
 
     def path(self, coefficients: Array) -> FourierPath | PosturePath:
         """Return the motion with coefficients of shape (joints, size)."""
@@ -321,10 +321,10 @@ class Basis(Protocol):
         """Return the coefficients of standing still at a posture of shape (joints,), shape (joints, size)."""
 
     def still(self, coefficients: Array) -> Array:
-        """Return the coefficients of standing at the middle of a motion, shape (joints, size)."""
+        """Return the coefficients of standing still at the middle of a motion, shape (joints, size)."""
 
     def samples(self, per_period: int) -> tuple[Array, Array]:
-        """Return times [s] to check limits at, and the time of information that each of them stands for [s]."""
+        """Return times [s] at which to check limits, and the time that each counts for in the information [s]."""
 
 
 @dataclass(frozen=True)
@@ -343,7 +343,7 @@ class FourierBasis:
 
     @cached_property
     def moving(self) -> NDArray[np.bool_]:
-        """Return True for all coefficients but the middle position, shape (size,)."""
+        """Return a mask that is True for all coefficients but the middle position, shape (size,)."""
         return np.arange(self.size) < 2 * self.harmonics
 
     def path(self, coefficients: Array) -> FourierPath:
@@ -353,15 +353,15 @@ class FourierBasis:
         return FourierPath(FourierSeries(self.base_frequency, a, b, q0), self.periods, self.ramp)
 
     def standing(self, posture: Array) -> Array:
-        """Return the coefficients of standing still."""
+        """Return the coefficients of standing still at a posture of shape (joints,), shape (joints, size)."""
         return np.column_stack([np.zeros((len(posture), 2 * self.harmonics)), posture])
 
     def still(self, coefficients: Array) -> Array:
-        """Return the coefficients of standing at the middle."""
+        """Return the coefficients of standing still at a motion's middle position, shape (joints, size)."""
         return self.standing(coefficients[:, -1])
 
     def samples(self, per_period: int) -> tuple[Array, Array]:
-        """Return times in one period, which count for all periods, and in both ramps, which have no weight."""
+        """Return times [s] in one period and both ramps, and weights [s]: all periods' in the period, 0 in ramps."""
         period = 1.0 / self.base_frequency
         step = period / per_period
         times = np.asarray(self.ramp + step * np.arange(per_period))
@@ -397,20 +397,20 @@ class PostureBasis:
 
     @cached_property
     def moving(self) -> NDArray[np.bool_]:
-        """Return True for all coefficients: the arm stands still where all postures are one."""
+        """Return a mask that is True for all coefficients, each of which is a posture; shape (size,)."""
         return np.ones(self.postures, dtype=bool)
 
     def path(self, coefficients: Array) -> PosturePath:
-        """Return the motion with coefficients of shape (joints, postures)."""
+        """Return the motion through the postures and back, of coefficients of shape (joints, postures)."""
         order = [*range(self.postures), *range(self.postures - 2, -1, -1)]
         return PosturePath(coefficients.T[order].copy(), np.array(self.times), self.dwell)
 
     def standing(self, posture: Array) -> Array:
-        """Return the coefficients of standing still."""
+        """Return the coefficients of standing still at a posture of shape (joints,), shape (joints, postures)."""
         return np.repeat(posture[:, None], self.postures, axis=1)
 
     def still(self, coefficients: Array) -> Array:
-        """Return the coefficients of standing at the mean posture."""
+        """Return the coefficients of standing still at a motion's mean posture, shape (joints, postures)."""
         return self.standing(coefficients.mean(axis=1))
 
     def samples(self, per_period: int) -> tuple[Array, Array]:

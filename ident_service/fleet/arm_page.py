@@ -52,7 +52,7 @@ class ArmShown:
 
 
 def arm_page(folder: Path, shown: ArmShown) -> str:
-    """Return the page of an arm as HTML.
+    """Return the HTML page of one arm of a fleet, from its result files and what the fleet found of it.
 
     Args:
         folder: folder with the arm's files and its evidence.
@@ -97,7 +97,7 @@ def arm_page(folder: Path, shown: ArmShown) -> str:
 
 
 def multiples(arm: str, figures: Sequence[Mapping[str, Any]]) -> Markup:
-    """Return the small drawings of one arm as HTML; nothing where there are none."""
+    """Return the small plots of one arm over time as HTML; empty where there are none."""
     if not figures:
         return Markup("")
     drawn = environment().get_template("multiples.html").render(arm=arm, figures=figures, width=WIDTH, height=HEIGHT)
@@ -106,7 +106,7 @@ def multiples(arm: str, figures: Sequence[Mapping[str, Any]]) -> Markup:
 
 @cache
 def environment() -> Environment:
-    """Return the environment of the templates of fleets."""
+    """Return the Jinja2 environment with the fleet's templates, made once."""
     return Environment(
         loader=PackageLoader(str(__package__)),
         autoescape=True,

@@ -77,12 +77,12 @@ class Leaves:
 
     @classmethod
     def of(cls, keys: Sequence[str]) -> Leaves:
-        """Return the leaves of an arm, whose last third is held out where there are several recordings."""
+        """Build the list of an arm's factor keys; of several, the last third (at least one) is held out."""
         return cls(tuple(keys), len(keys) - (max(len(keys) // 3, 1) if len(keys) > 1 else 0))
 
     @property
     def by_recording(self) -> bool:
-        """Return whether each recording is a cluster of the uncertainty: there are enough of them."""
+        """Return whether the recordings not held out are enough for each to be one cluster of the uncertainty."""
         return self.count >= STRETCHES
 
 
@@ -131,22 +131,22 @@ class Branches:
 
     @cached_property
     def single(self) -> Merged:
-        """Return the information of the first recording."""
+        """Return the information of the first recording, read from the store."""
         return _merged(self.leaves.keys[:1], self.described, self.store, whole=False)
 
     @cached_property
     def trained(self) -> Merged:
-        """Return the information of the recordings that are not held out."""
+        """Return the merged information of the recordings that are not held out."""
         return self._branch(0, self.leaves.keys[: self.leaves.count])
 
     @cached_property
     def held(self) -> Merged:
-        """Return the information of the recordings that are held out."""
+        """Return the merged information of the recordings that are held out."""
         return self._branch(1, self.leaves.keys[self.leaves.count :])
 
     @cached_property
     def merged(self) -> Merged:
-        """Return the information of all recordings."""
+        """Return the merged information of all recordings."""
         if self.leaves.count == len(self.leaves.keys):
             return self.trained
         found = merge([self.trained, self.held])
@@ -182,7 +182,7 @@ class ArmFits:
 def arm_fits(
     leaves: Leaves, described: Described, store: Store, between: Array, trained: _Given = None, held: _Given = None
 ) -> ArmFits | tuple[str, ...]:
-    """Fit an arm to its recordings, to those that are not held out, and to one; from the store where it has them.
+    """Fit an arm to all its recordings, to those not held out, and to one; or return the keys of missing factors.
 
     Args:
         leaves: factors of the arm.
@@ -215,14 +215,14 @@ def arm_fits(
 
 
 def reported_fits(fits: ArmFits | tuple[str, ...]) -> tuple[ArmFit, ArmFit] | tuple[str, ...]:
-    """Return what the fleet needs of an arm's fits: that of all recordings and the one without those held out."""
+    """Return an arm's fits to all recordings and to those not held out; missing factors' keys are passed through."""
     return (fits.fit, fits.trained) if isinstance(fits, ArmFits) else fits
 
 
 def population_of(
     fits_of: Mapping[str, tuple[ArmFit, ArmFit]], number: int, groups: Mapping[Group, Sequence[int]]
 ) -> Population:
-    """Return the common model of what `reported_fits` gives of the arms: of all recordings (0), or fewer (1)."""
+    """Estimate the common model of a fleet from each arm's fit number 0 (all recordings) or 1 (not held out)."""
     return population({arm: fits[number] for arm, fits in fits_of.items()}, groups)
 
 
@@ -230,7 +230,7 @@ def population_of(
 def errors_held_out(
     fits: ArmFits, arm: str, common: Population, described: Described
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the torque errors on recordings held out [percent], alone and drawn to the other arms.
+    """Return torque errors [percent] on held-out recordings, alone and pooled, of the `trained` and `single` fits.
 
     Args:
         fits: fits of an arm with recordings held out.
@@ -239,7 +239,7 @@ def errors_held_out(
         described: the arm.
 
     Returns:
-        The two of `trained` and the two of `single`.
+        Alone and pooled of `trained`, then of `single`.
     """
     held, prior = fits.held, common.other_arms(arm)
     assert held is not None  # noqa: S101 - as said above
@@ -258,7 +258,7 @@ def _stored_name(kind: str, described: Described, *more: Any) -> str:
 def stored_fit(
     information: Callable[[], Merged], of: tuple[tuple[str, ...], bool], described: Described, store: Store
 ) -> ArmFit:
-    """Return `arm_fit` of merged factors, from the store where it has been made.
+    """Return the fit of merged factors from the store; where it is absent or damaged, compute and store it.
 
     Args:
         information: function that returns the merged factors.
@@ -333,7 +333,7 @@ def arm_files(
     store: Store,
     shown: ArmShown,
 ) -> tuple[Files, dict[str, Any]]:
-    """Return the files of one arm's results with its page, and a summary of its estimate.
+    """Build one arm's result files, by name, and the summary of its estimate for the fleet; write nothing.
 
     Args:
         fits: of the arm.
@@ -364,7 +364,7 @@ def side_files(
     more: dict[str, Any],
     store: Store,
 ) -> Files:
-    """Return the files of the results from some recordings of an arm, before or after a change.
+    """Build the result files of some recordings of an arm, such as those before or after a change; write none.
 
     Args:
         keys: keys of the recordings' factors, in the order in which they are merged.

@@ -90,7 +90,7 @@ class Part:
 
     @property
     def label(self) -> str:
-        """Return what stands behind the file's name; empty for a whole recording."""
+        """Return `#2of5` for a piece of a recording, which follows the file's name; empty for a whole recording."""
         return "" if self.of == 1 else f"#{self.number + 1}of{self.of}"
 
 
@@ -137,12 +137,12 @@ class Row:
     conditions: dict[str, float]
 
     def to_json(self) -> bytes:
-        """Return the row as JSON; infinite numbers are null."""
+        """Return the row as JSON bytes; infinite numbers are null."""
         return json.dumps({key: _plain(value) for key, value in asdict(self).items()}).encode()
 
     @classmethod
     def from_json(cls, text: bytes) -> Row:
-        """Read a row.
+        """Read a row from its JSON; raises ValueError where it is none.
 
         Raises:
             ValueError: it is none.
@@ -216,12 +216,12 @@ class Merged:
 
     @property
     def fitted(self) -> Equations:
-        """Return the equations that estimates solve."""
+        """Return the equations that an estimate solves: one block per cluster."""
         return Equations(self.clusters, self.samples)
 
     @property
     def everything(self) -> Information:
-        """Return the information of all rows alike, which estimates are judged on (eq. 84)."""
+        """Return the information of all rows, in motion and near standstill, which judges estimates (eq. 84)."""
         return self.moving.merged(self.near)
 
 
@@ -233,31 +233,31 @@ class Described:
 
     @property
     def config(self) -> ArmConfig:
-        """Return the description."""
+        """Return the arm's description, parsed from its JSON."""
         return _model(self.description)[0].config
 
     @property
     def model(self) -> ArmModel:
-        """Return the model."""
+        """Return the arm's model."""
         return _model(self.description)[0]
 
     @property
     def base(self) -> BaseParameters:
-        """Return the grouping of its parameters."""
+        """Return the base parameters of the arm."""
         return _model(self.description)[1]
 
     @property
     def groups(self) -> dict[tuple[Kind, int], tuple[int, ...]]:
-        """Return the places of each physical effect's base parameters, by kind and number of joint or link."""
+        """Return the indices of each physical effect's base parameters, by (kind, number of joint or link)."""
         base = self.base
         return parameter_groups([base.names[column] for column in base.base])
 
     def key(self, sha256: str, part: Part) -> str:
-        """Return the name of the factor of a recording's piece."""
+        """Return the hash that names the factor of a recording's piece in the store, by its content and description."""
         return _hash(str(_FORMAT), sha256, f"{part.number}/{part.of}", self.config.sha256)
 
     def seen(self, part: Part) -> str:
-        """Return the name of the note that says which factor a file's version has."""
+        """Return the path in the store of the note that holds the factor's key for this version of a file."""
         source = part.source
         return f"{SEEN}/{_hash(str(_FORMAT), source.url, source.state, f'{part.number}/{part.of}', self.config.sha256)}"
 
@@ -273,7 +273,7 @@ def _hash(*parts: str) -> str:
 
 
 def require_mergeable(config: ArmConfig) -> None:
-    """Refuse a description whose estimate needs all recordings at once.
+    """Raise UsageError for options whose estimate needs all recordings of an arm at once, such as `method: iv`.
 
     Raises:
         UsageError: it asks for such an estimate.
@@ -308,7 +308,7 @@ class Settled:
 
 
 def trimmed(task: Callable[_Given, _Found]) -> Callable[_Given, _Found]:
-    """Wrap a task so that the C library keeps freed memory for the next one, and returns it after some tasks.
+    """Wrap a task so that freed memory stays for the next one, and goes back to the system after some tasks.
 
     Dask's workers give everything back at once, so that a sixth of a task's time would go into having the same pages
     again. If nothing was ever given back, a worker that has long finished would look as if it needed more than it may
@@ -329,7 +329,7 @@ def trimmed(task: Callable[_Given, _Found]) -> Callable[_Given, _Found]:
 
 
 def give_back() -> None:
-    """Give memory that this process does not use back to the system."""
+    """Return unused heap memory of this process to the system (`malloc_trim`); does nothing where that is unknown."""
     if (trim := _malloc_trim()) is not None:
         trim(0)
 
@@ -348,7 +348,7 @@ def _malloc_trim() -> Any:
 
 
 def settle(sources: Sequence[Source], description: str) -> Settled | tuple[Problem, ...]:
-    """Replace each automatic choice in a description by a number, decided by the first usable recordings together.
+    """Replace automatic choices in a description by numbers from the first usable recordings; else return problems.
 
     Args:
         sources: recordings of one arm.
@@ -399,7 +399,7 @@ def settle(sources: Sequence[Source], description: str) -> Settled | tuple[Probl
 @trimmed
 @one_blas_thread()
 def reduce_recording(part: Part, described: Described, store: Store, version: str, again: bool = False) -> Outcome:
-    """Reduce a recording, or a piece of one, to a factor in the store, unless it is there.
+    """Reduce a recording, or a piece, to a factor and its row in the store, unless there; a failure is returned.
 
     Args:
         part: to reduce.
@@ -438,7 +438,7 @@ def reduce_recording(part: Part, described: Described, store: Store, version: st
 
 
 def stored_rows(parts: Sequence[Part], described: Described, store: Store) -> list[Row | None]:
-    """Return the rows of parts that were reduced before, from files that are as they were; None for each other one."""
+    """Return the stored row of each part whose file is unchanged; None for each part that has to be reduced."""
     noted = [store.read(described.seen(part)) for part in parts]
     return [None if note is None else stored_row(store, note.decode(errors="replace")) for note in noted]
 
@@ -556,7 +556,7 @@ _upper = cache(np.triu_indices)
 
 
 def packed(merged: Merged) -> bytes:
-    """Return a factor as the bytes of an npz file: rows of each triangle, and the triangles' upper parts in a row."""
+    """Return a factor as the bytes of an npz file, which `unpacked` reads."""
     parts = (merged.moving, merged.near, *merged.clusters)
     values = []
     for part in parts:
@@ -577,7 +577,7 @@ def packed(merged: Merged) -> bytes:
 
 
 def unpacked(content: bytes, described: Described) -> Merged:
-    """Return the factor of an npz file.
+    """Read a factor from the bytes of an npz file; raises ValueError if it is damaged or of another arm.
 
     Raises:
         ValueError: it is damaged, or of another arm.
@@ -611,16 +611,13 @@ def unpacked(content: bytes, described: Described) -> Merged:
 @trimmed
 @one_blas_thread()
 def merge_stored(keys: Sequence[str], described: Described, store: Store, whole: bool) -> Merged | tuple[str, ...]:
-    """Merge stored factors in the order given, in a tree of `FAN_IN` neighbours each.
+    """Merge stored factors in a tree, in the order given; return the keys that are missing or damaged instead, if any.
 
     Args:
         keys: of the factors.
         described: the arm.
         store: store of the factors.
         whole: whether a recording is one cluster, for arms with enough of them.
-
-    Returns:
-        Their information; or the keys of those that are not there, or are damaged.
     """
     level = [_merge_leaf(keys[k : k + FAN_IN], described, store, whole) for k in range(0, len(keys), FAN_IN)]
     while len(level) > 1:
@@ -645,10 +642,9 @@ def _merge_leaf(keys: Sequence[str], described: Described, store: Store, whole: 
 
 @one_blas_thread()
 def merge(parts: Sequence[Merged | tuple[str, ...]]) -> Merged | tuple[str, ...]:
-    """Merge the information of recordings in the order given; neighbours' clusters become one where there are many.
+    """Merge the information of recordings in the order given; or return the missing keys that parts stand for.
 
-    Returns:
-        Their information; or the keys of all factors that some of the parts lack.
+    Neighbours' clusters become one where there are many.
     """
     if missing := tuple(key for part in parts if not isinstance(part, Merged) for key in part):
         return missing

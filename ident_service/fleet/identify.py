@@ -70,7 +70,7 @@ from ident_service.results.manifest import replacing_folder, require_place, writ
 def identify_fleet(
     request: FleetRequest, folder: Path, tell: Tell = lambda _: None, step: Step = lambda words, share: None
 ) -> FleetResult:
-    """Identify a fleet and write the results.
+    """Identify every arm of a fleet and write the results, which replace an earlier result in the folder.
 
     Args:
         request: recordings, description and options.

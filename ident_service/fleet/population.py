@@ -97,7 +97,7 @@ class ArmFit:
 
     @classmethod
     def of(cls, fit: LeastSquares, doubt: Uncertainty, clusters: int, total: Information, error: TorqueError) -> ArmFit:
-        """Return an estimate whose precision counts no differences from recording to recording."""
+        """Build an arm's fit with its precision; differences between recordings are not counted in it."""
         degrees = max(int(total.rows.sum()) - total.base, 1)
         variance = (fit.rho2**2 + float(np.sum((fit.rho1 - fit.R1 @ fit.beta) ** 2))) / degrees
         # One factor for all: factors of their own would turn the combinations that are known well into others.
@@ -105,7 +105,7 @@ class ArmFit:
         return cls(fit, doubt, clusters, precision, total, error)
 
     def weighed(self, between: Array) -> ArmFit:
-        """Return the estimate with its precision lowered by the variance from recording to recording.
+        """Return a copy with the precision lowered by the variance between recordings.
 
         Args:
             between: variance of the arm's mean by that [SI^2], shape (base,).
@@ -114,13 +114,13 @@ class ArmFit:
 
     @property
     def right(self) -> Array:
-        """Return the precision times the estimate, shape (base,)."""
+        """Return the right-hand side of the normal equations, precision times estimate, shape (base,)."""
         return np.asarray(self.precision @ self.fit.beta)
 
 
 @one_blas_thread()
 def arm_fit(merged: Merged, method: str) -> ArmFit:
-    """Estimate one arm from its merged factors, by least squares without a feasible set.
+    """Estimate one arm from its merged factors by least squares, without a feasible set; return it with precision.
 
     Args:
         merged: merged factors of the arm.
@@ -167,16 +167,19 @@ class Population:
 
     @property
     def common(self) -> Array:
-        """Return the common base parameters [SI], shape (base,)."""
+        """Return the base parameters common to the fleet [SI], shape (base,)."""
         return self.mean * self.scale
 
     @property
     def between(self) -> Array:
-        """Return the standard deviations between arms [SI], shape (base,)."""
+        """Return the standard deviation of each base parameter between arms [SI], shape (base,)."""
         return np.asarray(np.sqrt(self.variances) * self.scale)
 
     def other_arms(self, arm: str) -> tuple[Array, Array, Array]:
-        """Return mean, its covariance and T from all arms but one, in units of `scale`; of all, where it is alone."""
+        """Return mean, its covariance and between-arm variances of all other arms, scaled; of all for a lone arm.
+
+        All three are in units of `scale`.
+        """
         if len(self.arms) == 1:
             return self.mean, self.covariance, self.variances
         place = self.arms.index(arm)
@@ -189,7 +192,7 @@ class Population:
 
 @one_blas_thread()
 def population(fits: Mapping[str, ArmFit], groups: Mapping[Group, Sequence[int]]) -> Population:
-    """Estimate the common parameters and how far arms differ from them.
+    """Estimate base parameters common to all arms and the variance between arms, from each arm's own fit.
 
     Args:
         fits: fit of each arm, at least one.
@@ -318,7 +321,7 @@ def _drawn_to_group(own: Array, variances: Array, expected: Array, share: Array,
 
 
 def pooled_fit(alone: ArmFit, prior: tuple[Array, Array, Array], scale: Array) -> LeastSquares:
-    """Return an arm's estimate drawn to a fleet's, as least squares in units of its deviations.
+    """Return an arm's estimate combined with the other arms' as a prior, as least squares with unit noise.
 
     Args:
         alone: the arm's own.
@@ -346,7 +349,7 @@ def pooled_fit(alone: ArmFit, prior: tuple[Array, Array, Array], scale: Array) -
 
 
 def constrained(fit: LeastSquares, described: Described) -> Array:
-    """Return the estimate inside the arm's feasible set, shape (base,)."""
+    """Return the base parameters of least squares constrained to the arm's feasible set, shape (base,)."""
     return constrained_least_squares(fit, described.base, _conditions(described)).beta
 
 
@@ -364,7 +367,7 @@ def arm_estimate(
     drawn: LeastSquares | None = None,
     arms: int = 1,
 ) -> Estimate:
-    """Return one arm's estimate inside its feasible set, from `alone` or, where it is given, from `drawn` instead.
+    """Return one arm's estimate inside its feasible set, from `drawn` (pooled) where given, else from `alone`.
 
     Args:
         alone: unconstrained estimate of the arm alone.
@@ -452,7 +455,7 @@ class Unlike:
 
     @property
     def different(self) -> bool:
-        """Return whether the difference is significant and matters."""
+        """Return whether p is below 0.01 and the difference makes at least 1 % of a joint's torque."""
         return self.p < ALPHA and self.share >= RELEVANT_TORQUE
 
 
@@ -463,7 +466,7 @@ def unlike(
     groups: Mapping[Group, Sequence[int]],
     leading: tuple[str, ...],
 ) -> list[Unlike]:
-    """Test of every arm and group whether the arm differs from the others by more than they do among themselves.
+    """Test for every arm and group if the arm differs from the others; return all tests, none under three arms.
 
     Args:
         fits: fit of each arm alone.
@@ -520,14 +523,14 @@ class Shares:
 
     @property
     def percent(self) -> Array:
-        """Return the shares of the three [percent], shape (base, 3); zero where nothing was seen."""
+        """Return each parameter's variance due to arms, recordings and noise [percent], (base, 3); zero if unseen."""
         parts = np.column_stack([self.arms, self.recordings, self.noise])
         total = parts.sum(axis=1, keepdims=True)
         return np.asarray(100.0 * parts / np.where(total > 0.0, total, 1.0))
 
 
 def variance_shares(rows: Mapping[str, Sequence[Row]], groups: Mapping[Group, Sequence[int]]) -> Shares:
-    """Split the variance of each parameter over arms, recordings and noise.
+    """Split the variance of each parameter over differences between arms, between recordings, and noise.
 
     Args:
         rows: rows of each arm's recordings, by arm.
@@ -588,7 +591,7 @@ class HeldOut:
 
     @property
     def totals(self) -> tuple[float, float]:
-        """Return the root mean squares over the arms [percent], alone and pooled; NaN where nothing was held out."""
+        """Return RMS torque errors over the arms [percent], (alone, pooled); NaN where nothing was held out."""
         if not self.alone:
             return np.nan, np.nan
         mean = [float(np.sqrt(np.mean(np.square(list(one.values()))))) for one in (self.alone, self.pooled)]
@@ -596,18 +599,18 @@ class HeldOut:
 
     @property
     def gain(self) -> float:
-        """Return by how much of the error of each arm alone pooling lowers it; negative where it raises it."""
+        """Return the relative reduction of the held-out error by pooling, 0.1 for 10 %; negative where it grows."""
         alone, pooled = self.totals
         return 1.0 - pooled / alone if alone > 0.0 else np.nan
 
     @property
     def helps(self) -> bool:
-        """Return whether pooling is worth it; not where nothing was held out."""
+        """Return whether pooling lowers the held-out error by more than 1 %; False where nothing was held out."""
         alone, pooled = self.totals
         return bool(pooled < _WORTH * alone)
 
 
 @one_blas_thread()
 def error_on(unseen: Merged, fit: LeastSquares, described: Described) -> float:
-    """Return the torque error of an estimate, inside the feasible set, on recordings that it has not seen [percent]."""
+    """Return the torque error [percent] on unseen recordings of an estimate, constrained to its feasible set."""
     return torque_error(unseen.everything, constrained(fit, described)).relative_percent

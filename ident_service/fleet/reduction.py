@@ -107,7 +107,7 @@ class Recorded:
 
     @property
     def name(self) -> str:
-        """Return the file's name with its piece."""
+        """Return the recording's file name, with the label of its piece if it is one."""
         return self.url.rpartition("/")[2] + self.row.label
 
 
@@ -132,14 +132,14 @@ class Reduced:
     parts: tuple[Part, ...] = ()
 
     def keys_of(self, recordings: Iterable[Recorded]) -> tuple[str, ...]:
-        """Return the factors of recordings in the order in which they are merged: by the recordings' hashes."""
+        """Return the keys of recordings' factors in merging order: sorted by hash, label and key."""
         found = sorted(recordings, key=lambda one: (one.row.sha256, one.row.label, one.row.key))
         return tuple(one.row.key for one in found)
 
 
 @contextmanager
 def connected(request: FleetRequest, tell: Tell) -> Iterator[Client]:
-    """Yield a client of the scheduler that was asked for, or of an embedded one, after comparing versions.
+    """Yield a Dask client of the given scheduler, or of one started here; raises if workers do not fit.
 
     Raises:
         Unavailable: no scheduler answers there, or it has no worker.
@@ -239,7 +239,7 @@ def _require_workers(client: Client, address: str, tell: Tell) -> None:
 
 
 def result_of(future: Future, what: str) -> Any:
-    """Wait for the result of a task.
+    """Wait for a Dask task and return its result; raises Unavailable if it ended every worker that tried.
 
     Args:
         future: future of the task.
@@ -254,10 +254,10 @@ def result_of(future: Future, what: str) -> Any:
         raise Unavailable(f"{what} ended every worker that tried; give workers more with --memory") from None
 
 
-def in_order(
+def results_as_completed(
     client: Client, function: Callable[..., _Result], tasks: Sequence[tuple[Any, ...]], failed: Callable[[int], _Result]
 ) -> Iterator[tuple[int, _Result]]:
-    """Run a function on each tuple of arguments and yield number and result as they come.
+    """Run a function on Dask for each tuple of arguments; yield (task's number, result) in order of completion.
 
     Args:
         client: of the scheduler.
@@ -308,7 +308,7 @@ class Listed:
 
 
 def list_recordings(request: FleetRequest) -> Listed:
-    """Return the recordings of a request and whose they are.
+    """Find the recordings that a request's patterns name, and the arm of each; nothing of them is read.
 
     Raises:
         UsageError, ConfigError: the request or the description is not valid, or a pattern names nothing.
@@ -328,7 +328,7 @@ def reduce_fleet(
     tell: Tell,
     step: Step = lambda words, share: None,
 ) -> Reduced:
-    """Reduce recordings, each to its factor and row.
+    """Reduce every recording of a fleet on the workers to its factor and row in the store; return them by arm.
 
     Args:
         client: of the scheduler.
@@ -380,7 +380,7 @@ def _by_time(one: Recorded) -> tuple[float, str, str]:
 
 
 def absolute_url(url: str) -> str:
-    """Return a URL that workers elsewhere on this machine understand."""
+    """Return a local path as an absolute one, so that workers find it; a URL with a protocol unchanged."""
     return url if "://" in url or "::" in url else str(Path(url).absolute())
 
 
@@ -460,7 +460,7 @@ def _mapped(
     def unknown(number: int) -> list[Row | None]:
         return [None for _ in groups[number]]
 
-    for number, rows in in_order(client, stored_rows, asked, unknown):
+    for number, rows in results_as_completed(client, stored_rows, asked, unknown):
         for k, row in zip(groups[number], rows, strict=True):
             outcomes[k] = None if row is None else Outcome(parts[k], row, computed=False)
     new = [k for k, outcome in enumerate(outcomes) if outcome is None]
@@ -474,7 +474,7 @@ def _mapped(
         return Outcome(part, None, Problem(part.source.url, part.label, "worker", text))
 
     every = max(len(new) // 10, 1)
-    for count, (number, outcome) in enumerate(in_order(client, reduce_recording, tasks, died), 1):
+    for count, (number, outcome) in enumerate(results_as_completed(client, reduce_recording, tasks, died), 1):
         if outcome.problem is not None and outcome.problem.kind == "version":
             raise UsageError(outcome.problem.message)
         outcomes[new[number]] = outcome
@@ -485,7 +485,7 @@ def _mapped(
 
 
 def reduce_again(client: Client, reduced: Reduced, keys: Collection[str], store: Store) -> None:
-    """Compute factors again that are gone from the store, or damaged.
+    """Compute factors that are gone or damaged again from their recordings; raises StorageError where it fails.
 
     Args:
         client: of the scheduler.
@@ -512,7 +512,9 @@ def reduce_again(client: Client, reduced: Reduced, keys: Collection[str], store:
 def merged_on_workers(
     client: Client, keys: Sequence[str], described: Described, store: Store, *, whole: bool
 ) -> Future | None:
-    """Merge factors in a tree of tasks; None where they are so few that a task that needs them can merge them itself.
+    """Start tasks that merge factors in a tree and return the last one's future; None for factors that are few.
+
+    Few enough are merged by the task that needs them.
 
     Args:
         client: of the scheduler.
@@ -533,7 +535,7 @@ def merged_on_workers(
 
 
 def status_of(request: FleetRequest) -> Mapping[str, Any]:
-    """Return which recordings have factors in the store, by arm, and how large they are; nothing is computed.
+    """Return counts and bytes of the store's factors, and per arm how many recordings are reduced; compute nothing.
 
     Raises:
         UsageError, ConfigError: the request or the description is not valid.

@@ -61,7 +61,7 @@ class FleetResult:
 
     @property
     def changed(self) -> list[Change]:
-        """Return the changes that are significant and matter."""
+        """Return the changes over time that are significant and matter."""
         return self.compared.changed
 
 
@@ -89,7 +89,7 @@ def fleet_document(
     summaries: Summaries,
     sha256: str,
 ) -> dict[str, Any]:
-    """Return the content of `fleet.json`, but for the alarms.
+    """Build the content of `fleet.json`, without the alarms.
 
     Args:
         result: result of the identification.
@@ -230,7 +230,7 @@ _SCHEMA = pa.schema(
 
 
 def write_table(path: Path, result: FleetResult, summaries: Summaries) -> None:
-    """Write the table: one row per parameter of each recording's own estimate, and of each arm's."""
+    """Write `path` as a Parquet table: a row per parameter of each recording's own estimate and each arm's."""
     described, base = result.reduced.described, result.reduced.described.base
     size = base.size
     names = {k: group_name(group, described) for group, places in described.groups.items() for k in places}
@@ -304,7 +304,7 @@ def _of_recording(one: Recorded, summary: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def drawing(points: Array, common: float, change: Change | None) -> dict[str, Any]:
-    """Return the coordinates of one small multiple: value with interval over time, the fleet's mean, a change."""
+    """Return the pixel coordinates of one small plot: values with intervals over time, fleet's mean, a change."""
     low, high = float((points[:, 1] - points[:, 2]).min()), float((points[:, 1] + points[:, 2]).max())
     low, high = min(low, common), max(high, common)
     first, last = float(points[0, 0]), float(points[-1, 0])
@@ -332,7 +332,7 @@ def drawing(points: Array, common: float, change: Change | None) -> dict[str, An
 def arm_trends(
     arm: str, reduced: Reduced, compared: Compared, common: Array, most: int | None = None
 ) -> list[dict[str, Any]]:
-    """Return the small multiples of one arm: of each group the parameter that moved most, the likeliest change first.
+    """Return small plots of one arm: per group the parameter that changed most, likeliest changes first.
 
     Args:
         arm: name.
@@ -358,7 +358,7 @@ def arm_trends(
 
 
 def shown_of(arm: str, reduced: Reduced, compared: Compared, common: Array) -> ArmShown:
-    """Return what the page of one arm shows besides its own estimate."""
+    """Return what an arm's page shows besides its estimate: its recordings (of many, those with warnings), trends."""
     rows = []
     for one in reduced.arms[arm]:
         row, when = one.row, _when(one.at)[:16].replace("T", " ")
@@ -379,7 +379,7 @@ def _trends(result: FleetResult) -> list[dict[str, Any]]:
 
 
 def fleet_page(result: FleetResult, request: FleetRequest) -> str:
-    """Return the page: one file, no network, readable without scripts."""
+    """Return the fleet's HTML page: one file, no network, readable without scripts."""
     document = result.document
     qualities = [
         {

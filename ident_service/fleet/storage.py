@@ -67,7 +67,7 @@ def _system(url: str) -> tuple[Any, str]:
 
 
 def persistently(action: Callable[[], _Result], url: str, pauses: Sequence[float] = PAUSES) -> _Result:
-    """Call a function that uses storage, and again after pauses where it failed for a reason that may pass.
+    """Call a function that uses storage, again after pauses for transient errors; return its result.
 
     Args:
         action: function to call; it can be repeated.
@@ -95,7 +95,7 @@ def persistently(action: Callable[[], _Result], url: str, pauses: Sequence[float
 
 
 def find(patterns: Sequence[str]) -> list[Source]:
-    """Find the recordings that patterns name: files, globs, or folders with everything in them; sorted, each once.
+    """Return the files that patterns name (files, globs, whole folders), sorted by URL, each once.
 
     Raises:
         UsageError: a pattern names nothing, or storage that is not known.
@@ -143,7 +143,7 @@ def _protocols(system: Any) -> tuple[str, ...]:
 
 @contextmanager
 def local_copy(source: Source) -> Iterator[Path]:
-    """Yield a recording as a local file: itself, or a copy that is removed afterwards.
+    """Yield the path of a local recording itself, or of a temporary copy of a remote one, then removed.
 
     Raises:
         StorageError: it cannot be read, or is shorter than storage says.
@@ -178,7 +178,7 @@ class Store:
     url: str
 
     def read(self, name: str) -> bytes | None:
-        """Return a file's content; None where there is no such file.
+        """Return a stored file's content; None where there is no such file.
 
         Raises:
             StorageError: storage cannot be reached.
@@ -191,7 +191,7 @@ class Store:
         return content
 
     def write(self, name: str, content: bytes) -> None:
-        """Write a file, which appears whole or not at all; an earlier one of that name is replaced.
+        """Write a stored file whole or not at all; an earlier one of that name is replaced.
 
         Raises:
             StorageError: storage cannot be reached, or is full.
@@ -219,7 +219,7 @@ class Store:
         persistently(put, self._place(name))
 
     def names(self, folder: str) -> Iterator[tuple[str, int]]:
-        """Yield name and size [bytes] of every file in a folder of the store.
+        """Yield name and size [bytes] of every file in a folder of the store, sorted; none where there is no folder.
 
         Raises:
             StorageError: storage cannot be reached.

@@ -128,7 +128,7 @@ def _estimates(recordings: Sequence[Recorded], number: int, places: Sequence[int
 
 @one_blas_thread()
 def scatter_of(arms: Mapping[str, Sequence[Recorded]], groups: Mapping[Group, Sequence[int]]) -> dict[Group, Scatter]:
-    """Estimate how much recordings of one arm differ, per group, from neighbours in time of all arms."""
+    """Estimate per group how much an arm's recordings scatter, from neighbours in time of all arms."""
     found = {}
     for number, (group, places) in enumerate(groups.items()):
         steps: list[Array] = []
@@ -172,7 +172,7 @@ def change_points(
     groups: Mapping[Group, Sequence[int]],
     scatter: Mapping[Group, Scatter],
 ) -> list[Change]:
-    """Find the most likely change of every group of every arm with enough recordings, and test it over the fleet.
+    """Find per arm and group the most likely change over time; return all, tested with Holm's correction.
 
     Args:
         arms: recordings of each arm, by time.
@@ -297,7 +297,7 @@ def _carried(recordings: Sequence[Recorded]) -> Array:
 def dependences(
     arms: Mapping[str, Sequence[Recorded]], groups: Mapping[Group, Sequence[int]], scatter: Mapping[Group, Scatter]
 ) -> list[Dependence]:
-    """Regress every base parameter on the conditions that recordings carry, each arm with a level of its own."""
+    """Regress every base parameter on each recorded condition, with a level per arm; return slopes with p-values."""
     every = []
     for name in CONDITIONS.values():
         carrying = {arm: [one for one in recordings if name in one.row.conditions] for arm, recordings in arms.items()}
@@ -341,18 +341,18 @@ class Compared:
 
     @property
     def changed(self) -> list[Change]:
-        """Return the changes that are significant and matter."""
+        """Return the changes over time that are significant and matter."""
         return [one for one in self.changes if one.changed]
 
     def changes_of(self, arm: str) -> list[Change]:
-        """Return the most likely change of every group of an arm."""
+        """Return the tested changes of one arm, one for each group that has enough recordings."""
         return [one for one in self.changes if one.arm == arm]
 
 
 def compare_arms(
     arms: Mapping[str, Sequence[Recorded]], fits: Mapping[str, ArmFit], found: Population, described: Described
 ) -> Compared:
-    """Test every arm of a fleet against the others, and over time.
+    """Test every arm of a fleet against the others and over time; return all tests with the scatter.
 
     Args:
         arms: recordings of each arm, by time.
@@ -372,7 +372,7 @@ def compare_arms(
 
 
 def series(recordings: Sequence[Recorded], place: int, number: int, index: int, scatter: Scatter) -> Array:
-    """Return one parameter of one arm over time: time [s since 1970], value, and half its 95 % interval [SI].
+    """Return one parameter of one arm over time: rows of time [s since 1970], value, half its 95 % interval [SI].
 
     Args:
         recordings: of the arm, by time.

@@ -28,7 +28,7 @@ _LEAST = 0.005  # m, of an arm whose joints all meet in one point
 
 
 def visible_bodies(model: ArmModel) -> list[Body]:
-    """Return solids of base and links, in their joints' frames: those known, and sticks from joint to joint elsewhere.
+    """Return the solids to draw of base and links, in their joints' frames; sticks for links without known bodies.
 
     Geometry that cannot be read is no reason to show nothing: then the whole arm is sticks.
     """
@@ -85,7 +85,7 @@ MESHES = frozenset({".stl", ".obj", ".dae", ".glb", ".gltf"})
 
 
 def visual_meshes(file: Path, kinematics: Kinematics, chain: Chain) -> list[Mesh]:
-    """Return the meshes of the visual elements of a URDF.
+    """Return the triangle meshes of a URDF's visual elements, placed in their joints' frames.
 
     Args:
         file: the URDF; meshes are looked for below its folder, those of `package://NAME/...` also without the name.
@@ -142,7 +142,7 @@ class PlacedLink:
 
 
 def placed_links(urdf: TextFile, kinematics: Kinematics, chain: Chain) -> Iterator[PlacedLink]:
-    """Yield the links of a URDF that are part of the arm or of what it stands on.
+    """Yield the URDF's links of the arm and of what it stands on, each with its place in its joint's frame.
 
     Raises:
         ModelError: not a URDF.
@@ -158,7 +158,7 @@ def placed_links(urdf: TextFile, kinematics: Kinematics, chain: Chain) -> Iterat
 
 
 def mesh_scale(text: str, where: str) -> Array:
-    """Return the `scale` of a mesh, shape (3,); UsageError where it is not three numbers."""
+    """Return the three factors of a mesh's `scale`, shape (3,); raises UsageError where it is not three numbers."""
     try:
         values = np.array([float(word) for word in text.split()])
     except ValueError:

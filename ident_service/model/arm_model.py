@@ -35,13 +35,13 @@ class ArmModel:
     prior: Array | None
 
     def with_options(self, options: Identification | None = None, **changes: Any) -> ArmModel:
-        """Return the arm with other options of identification, or with some of its own changed by their keys."""
+        """Return the arm with other `options` of identification, or with its own, changed by these keys."""
         options = (options or self.config.identification).model_copy(update=changes)
         return replace(self, config=self.config.model_copy(update={"identification": options}))
 
 
 def arm_model(config: ArmConfig, *, bodies: bool = True) -> ArmModel:
-    """Build the model of an arm.
+    """Build chain, parameter layout and prior parameters of an arm from its description; raises where they do not fit.
 
     Args:
         config: the description.
@@ -124,7 +124,7 @@ def _require_bodies(config: ArmConfig, urdf: TextFile, inertias: Array) -> None:
 
 
 def with_payload(config: ArmConfig, names: tuple[str, ...], layout: Layout, delta: Array) -> Array:
-    """Return parameters of an arm with what its description's payload adds to them.
+    """Return link parameters plus those of the description's payload, shape (layout.size,); unchanged without one.
 
     Args:
         config: the description.
@@ -146,7 +146,7 @@ def with_payload(config: ArmConfig, names: tuple[str, ...], layout: Layout, delt
 
 
 def control_model(model: ArmModel) -> ArmModel:
-    """Return the model that the control law, and every prediction of it, computes torques with.
+    """Return the model for the control law and its predictions: the prior with at least the stated drive inertia.
 
     Its prior has the drive inertia that the description states (`joints.*.drive_inertia`) where the prior, often a CAD
     model of the links alone, has less. The description states what is felt at the joint, `sum_d C_dj^2 Ia_d` of drives

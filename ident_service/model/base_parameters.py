@@ -23,13 +23,13 @@ from ident_service.model.regressor import joint_regressor
 
 
 def format_number(value: float) -> str:
-    """Return the shortest decimal that reads back as the same number, without a trailing `.0`."""
+    """Return the shortest decimal that reads back as the same float, without a trailing `.0`."""
     text = repr(float(value))
     return text.removesuffix(".0")
 
 
 def format_expression(terms: Sequence[tuple[float, str]]) -> str:
-    """Write a sum, in the order given; neighbours and others with the same coefficient share parentheses.
+    """Return a sum as text, in the order given; names with the same coefficient share parentheses.
 
     Args:
         terms: coefficient and name; coefficients are not zero.
@@ -52,7 +52,7 @@ def format_expression(terms: Sequence[tuple[float, str]]) -> str:
 
 
 def parse_exactly(text: str) -> dict[str, Fraction]:
-    """Parse a sum into its coefficients by name, decimals as they are written.
+    """Parse an expression into exact coefficients by name; raises ParameterError where it is no sum.
 
     Raises:
         ParameterError: not a sum as in `certificate_verifier.parse_expression`; the message says where.
@@ -64,7 +64,7 @@ def parse_exactly(text: str) -> dict[str, Fraction]:
 
 
 def parse_expression(text: str) -> dict[str, float]:
-    """Parse a sum into its coefficients by name.
+    """Parse an expression into coefficients by name, as floats; raises ParameterError where it is no sum.
 
     Raises:
         ParameterError: as `parse_exactly`, or a coefficient too large for a float.
@@ -128,12 +128,12 @@ class BaseParameters:
 
     @cached_property
     def dependent(self) -> NDArray[np.intp]:
-        """Return the columns P_d selects: everything that is not a base column."""
+        """Return the indices of link parameters that are not base columns (those that P_d selects)."""
         return np.setdiff1d(np.arange(len(self.names)), self.base)
 
     @cached_property
     def expressions(self) -> tuple[str, ...]:
-        """Return each base parameter as a sum of link parameters (table 3)."""
+        """Return each base parameter as text, a sum of link parameters with coefficients (table 3)."""
         return tuple(
             format_expression([(float(row[column]), self.names[column]) for column in np.flatnonzero(row)])
             for row in self.K
@@ -141,7 +141,7 @@ class BaseParameters:
 
 
 def base_parameters(chain: Chain, layout: Layout) -> BaseParameters:
-    """Return the base parameters of a mechanism; the same ones every time for the same mechanism."""
+    """Compute the base parameters of a mechanism from its regressor at seeded random states; always the same."""
     rng = np.random.default_rng(_SEED)
     samples = max(8, -(-4 * layout.size // chain.joints))
     states = rng.uniform(-np.pi, np.pi, size=(3, samples, chain.joints))
@@ -156,7 +156,7 @@ def base_parameters(chain: Chain, layout: Layout) -> BaseParameters:
 
 
 def grouping(H: Array, names: tuple[str, ...], units: tuple[str, ...]) -> BaseParameters:
-    """Return the grouping of parameters whose effects are the columns of a matrix.
+    """Group parameters into base parameters: the first independent columns of H, others as combinations of them.
 
     Args:
         H: a regressor at enough states, or K itself for some of its columns, shape (rows, names).
@@ -172,7 +172,7 @@ def grouping(H: Array, names: tuple[str, ...], units: tuple[str, ...]) -> BasePa
 
 
 def remarks_on_angles(base: BaseParameters) -> tuple[str, ...]:
-    """Return remarks on base parameters that exist only because angles of the mechanism are rounded.
+    """Return a remark where base parameters exist only since angles are rounded (1.5708 for pi/2); else nothing.
 
     Columns of real mechanisms are a third independent of the others, or not at all; 1.5708 for pi/2 leaves a millionth.
     """
@@ -191,7 +191,7 @@ def remarks_on_angles(base: BaseParameters) -> tuple[str, ...]:
 
 
 def static_base_parameters(chain: Chain, layout: Layout) -> BaseParameters:
-    """Return the base parameters that standing still and slow motion identify: gravity's and the friction terms."""
+    """Compute the base parameters that standing still and slow motion identify: gravity's and the friction terms."""
     rng = np.random.default_rng(_SEED)
     samples = max(8, -(-4 * layout.size // chain.joints))
     position, velocity = rng.uniform(-np.pi, np.pi, size=(2, samples, chain.joints))
@@ -219,7 +219,7 @@ def _first_independent(H: Array) -> tuple[NDArray[np.intp], Array, Array]:
 
 
 def base_from_expressions(expressions: tuple[str, ...], names: tuple[str, ...]) -> BaseParameters:
-    """Return the grouping that a table of expressions defines, without an arm model.
+    """Build the base parameters that a table of expressions defines, without an arm model or units.
 
     Args:
         expressions: one per base parameter.

@@ -32,12 +32,12 @@ _TOUCH = 1e-9  # m; what comes nearer to a box may as well be inside it
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Return inner products along the first axis."""
+    """Return inner products of vectors (x, y, z along the first axis)."""
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 def unit(vectors: Array) -> tuple[Array, Array]:
-    """Return lengths and directions; a vector of length zero has direction zero."""
+    """Return lengths and unit vectors (x, y, z along the first axis); a zero vector stays zero."""
     length = np.sqrt(dot(vectors, vectors))
     # Squares of anything shorter underflow.
     return length, vectors * (1.0 / np.maximum(length, 1e-150))
@@ -46,7 +46,9 @@ def unit(vectors: Array) -> tuple[Array, Array]:
 def between_segments(
     start: Array, along: Array, other_start: Array, other_along: Array, squares: Array, other_squares: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Return distances between segments (Ericson, Real-Time Collision Detection, 5.1.9), also parallel and degenerate.
+    """Return distances [m], directions and nearest points of pairs of segments, also parallel or degenerate.
+
+    After Ericson, Real-Time Collision Detection, 5.1.9.
 
     Args:
         start: starting points of the first segments [m], shape (3, pairs, samples).
@@ -78,7 +80,7 @@ def _inverse(squares: Array) -> Array:
 
 
 def to_half_spaces(start: Array, along: Array, normal: Array, offset: Array) -> tuple[Array, Array]:
-    """Return distances of segments to half spaces, `normal . x - offset` at the lower end.
+    """Return signed distances [m] of segments to half spaces, and which end is nearest: 0 start, 1 end.
 
     Args:
         start: [m], shape (3, pairs, samples).
@@ -95,7 +97,7 @@ def to_half_spaces(start: Array, along: Array, normal: Array, offset: Array) -> 
 
 
 def to_boxes(start: Array, along: Array, half: Array) -> tuple[Array, Array, Array]:
-    """Return signed distances of segments to boxes about the origin, along the axes.
+    """Return signed distances [m] of segments to axis-aligned boxes about the origin, gradients and nearest shares.
 
     Outside, half the slope of the squared distance is linear between the places where the line crosses a face's plane.
     Of a line that enters the box the deepest point counts, whose negative distance to the nearest face is convex too.
@@ -222,13 +224,10 @@ class CapsuleModel:
         self._smallest: Array | None = None
 
     def distances(self, position: Array) -> Array:
-        """Return a lower bound of the distance of each pair.
+        """Return a lower bound of the distance of each pair [m], negative in overlap, shape (pairs, samples).
 
         Args:
             position: [rad or m], shape (samples, joints).
-
-        Returns:
-            Signed distances [m], negative where the pair overlaps, shape (pairs, samples).
 
         Raises:
             ModelError: positions of another shape.
@@ -248,7 +247,7 @@ class CapsuleModel:
         return self._smallest.copy()
 
     def pull(self, seeds: Array) -> Array:
-        """Return the gradient of `sum(seeds * distances)` at the positions of the last call of `distances`.
+        """Return the gradient of `sum(seeds * distances)` at the last positions, shape (samples, joints).
 
         Args:
             seeds: shape (pairs, samples).
@@ -280,7 +279,7 @@ def _stays(body: Body) -> bool:
 
 
 def containing_capsule(body: Body) -> Capsule:
-    """Return the body's own capsule, or one around it: along a box's longest edge, along a cylinder's axis."""
+    """Return the body's own capsule, or one that contains its box or cylinder; not for half spaces."""
     solid = body.solid
     if isinstance(solid, Capsule):
         return solid

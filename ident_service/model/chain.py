@@ -77,7 +77,7 @@ class Chain:
         return len(self.names)
 
     def ancestors(self, joint: int) -> tuple[int, ...]:
-        """Return the joints that move `joint`'s link, from the base outwards, `joint` itself included."""
+        """Return the indices of the joints that move `joint`'s link, from the base outwards, `joint` included."""
         path = [joint]
         while (parent := self.parents[path[-1]]) != WORLD:
             path.append(parent)
@@ -85,13 +85,13 @@ class Chain:
 
 
 def rotation_x(angle: float) -> Array:
-    """Return the rotation about x by `angle` [rad], shape (3, 3)."""
+    """Return the rotation matrix about x by `angle` [rad], shape (3, 3)."""
     c, s = _clean(np.cos(angle)), _clean(np.sin(angle))
     return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
 
 
 def rotation_z(angle: float) -> Array:
-    """Return the rotation about z by `angle` [rad], shape (3, 3)."""
+    """Return the rotation matrix about z by `angle` [rad], shape (3, 3)."""
     c, s = _clean(np.cos(angle)), _clean(np.sin(angle))
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
@@ -102,7 +102,7 @@ def _clean(value: float) -> float:
 
 
 def chain_from_dh(table: DHTable, gravity: tuple[float, float, float]) -> Chain:
-    """Return the serial chain of a DH table.
+    """Return the serial chain of a standard or modified DH table, with this gravity [m/s^2].
 
     Standard: `A_k = Rz(theta) Tz(d) Tx(a) Rx(alpha)`, link frames distal as in the paper (table 2). Modified (Craig):
     `A_k = Rx(alpha) Tx(a) Rz(theta) Tz(d)`, link frames on the joint's own axis. The joint variable adds to theta, or

@@ -55,7 +55,7 @@ class Scene:
 
 
 def link_bodies(model: ArmModel) -> list[Body]:
-    """Return the solids of base and links: of the configuration, for links without any there of the URDF.
+    """Return the solids of base and links: those described under `geometry`; for other links, those of the URDF.
 
     Raises:
         ModelError: a link that does not exist, or a mesh where capsules are needed.
@@ -67,12 +67,12 @@ def link_bodies(model: ArmModel) -> list[Body]:
 
 
 def surroundings(model: ArmModel) -> list[Body]:
-    """Return the obstacles of the workspace, and the half spaces outside the box that the arm must stay in."""
+    """Return the workspace's obstacles as solids, and half spaces for all outside of the box the arm must stay in."""
     return [*_obstacles(model.config.workspace), *_inside(model.config.workspace)]
 
 
 def scene(model: ArmModel) -> Scene:
-    """Return the bodies of the configuration and, for links without geometry there, of the URDF.
+    """Collect all bodies of arm and workspace, and the pairs of them that must not touch.
 
     Raises:
         ModelError: a link that does not exist, or a mesh where capsules are needed.
@@ -188,7 +188,7 @@ class _Hull:
 
 
 def distance_lipschitz_constants(scene: Scene) -> tuple[Array, ...]:
-    """Return per pair constants L with `|d(q) - d(p)| <= sum_k L_k |q_k - p_k|`.
+    """Return per pair constants L, shape (joints,), with `|d(q) - d(p)| <= sum_k L_k |q_k - p_k|`.
 
     Sliding joints are taken to stay within their position limits; where one has none, the joints that carry it have
     infinite constants.
@@ -298,13 +298,10 @@ class CollisionModel:
         self._require_freedom(around, model.config.name)
 
     def distances(self, position: Array) -> Array:
-        """Return the signed distance of each pair.
+        """Return the exact signed distance of each pair [m], negative in overlap, shape (samples, pairs).
 
         Args:
             position: [rad or m], shape (samples, joints).
-
-        Returns:
-            Signed distances [m], negative where the pair overlaps, shape (samples, pairs).
 
         Raises:
             ModelError: positions of another shape.
@@ -346,7 +343,7 @@ class CollisionModel:
 
 
 def share_touching(model: ArmModel, within: float, postures: int, seed: int) -> dict[tuple[str, str], float]:
-    """Return the share of random postures in which the bodies of each pair touch, the moving link first.
+    """Return per pair of bodies the share of random postures in which they touch, from 0 to 1; moving link first.
 
     Args:
         model: model of an arm, also of one whose bodies always touch.
@@ -379,7 +376,7 @@ def share_touching(model: ArmModel, within: float, postures: int, seed: int) -> 
 
 
 def kinematics(chain: Chain) -> pin.Model:
-    """Return a pinocchio model of the joints alone, without masses."""
+    """Build a pinocchio model of the joints alone, without masses."""
     model = pin.Model()
     for k in range(chain.joints):
         axis = chain.axes[k]
@@ -390,7 +387,7 @@ def kinematics(chain: Chain) -> pin.Model:
 
 
 def lowest_point(model: ArmModel) -> Callable[[Array], float]:
-    """Create the function that returns the height of the lowest point of the arm.
+    """Create a function from a position [rad or m] to the height of the arm's lowest point above the base [m].
 
     Args:
         model: model of the arm, whose links are taken as the capsules of its geometry and the origins of their frames.
@@ -422,7 +419,7 @@ def lowest_point(model: ArmModel) -> Callable[[Array], float]:
 
 
 def geometry(around: Scene, contacts: Sequence[tuple[int, int]]) -> tuple[pin.GeometryModel, pin.GeometryData]:
-    """Return all bodies as coal geometry, with the data for the distances of some pairs of them.
+    """Build coal geometry of all bodies, and the data object for the distances of the given pairs of them.
 
     Args:
         around: the bodies.
@@ -494,7 +491,7 @@ class Contact:
         self.clear.setflags(write=False)
 
     def depths(self, position: Array) -> Array:
-        """Return the penetration depth of each pair of solids that is checked in this call.
+        """Return the penetration depth [m] of the pairs checked in this call, positive in overlap; -inf for others.
 
         Args:
             position: [rad or m], shape (joints,).

@@ -27,7 +27,7 @@ _COARSER = 1.5  # the next one
 def joint_triangles(
     urdf: TextFile, kinematics: Kinematics, chain: Chain, folder: Path
 ) -> tuple[dict[int, Array], list[str]]:
-    """Read the meshes that are drawn of a URDF: those of a link's `visual` elements, else of `collision`.
+    """Read a URDF's meshes, `visual` else `collision`; return triangles per joint, and why others have none.
 
     A joint is left out where a part of it has no mesh that can be read: a link without its cover would mislead.
 
@@ -78,7 +78,7 @@ def _link_triangles(link: PlacedLink, folder: Path) -> list[Array]:
 
 
 def coarsened(corners: Array, most: int) -> Array:
-    """Move corners onto a grid until so few triangles are left.
+    """Return at most `most` triangles: corners are moved onto ever coarser grids, and collapsed triangles dropped.
 
     Args:
         corners: of the triangles [m], shape (triangles, 3, 3).

@@ -67,7 +67,9 @@ class DynamicModel:
         self._shared = chain.coupling.T @ (inertia[:, None] * chain.coupling) - np.diag(drives.armature)
 
     def turned(self, direction: Array, step: Array) -> Array:
-        """Return the direction of dry friction after a step (Dahl 1968); exact where no drive reverses in the step.
+        """Return each drive's dry-friction direction, -1 to 1, after a displacement of the joints (Dahl 1968).
+
+        Exact where no drive reverses in the step.
 
         Args:
             direction: direction before the step, per drive, between -1 and 1, shape (..., joints); the signs of the
@@ -80,15 +82,12 @@ class DynamicModel:
         return advance_dahl_state(direction, np.asarray(step, dtype=float) @ self.arm.chain.coupling.T, self.presliding)
 
     def friction(self, velocity: Array, direction: Array | None = None) -> Array:
-        """Return the friction torque, offsets included.
+        """Return the friction torque of the joints [N m or N], offsets included, shape (..., joints).
 
         Args:
             velocity: [rad/s or m/s], shape (..., joints).
             direction: direction of dry friction per drive, from `turned`, shape (..., joints); when None, the sign of
                 the drive's velocity: none at rest, and no pre-sliding.
-
-        Returns:
-            [N m or N], shape (..., joints).
         """
         coupling, layout = self.arm.chain.coupling, self.arm.layout
         rate = np.asarray(velocity, dtype=float) @ coupling.T
@@ -104,7 +103,7 @@ class DynamicModel:
     def inverse_dynamics(
         self, position: Array, velocity: Array, acceleration: Array, direction: Array | None = None
     ) -> Array:
-        """Return the torque of a motion: links, drives and friction, as the regressor predicts it (eq. 29).
+        """Return the joint torques [N m or N] of links, drives and friction at one state of motion (eq. 29).
 
         Args:
             position: [rad or m], shape (joints,).
@@ -145,7 +144,7 @@ def read_back(
     gravity: tuple[float, float, float],
     kinematics: Kinematics | None = None,
 ) -> WrittenArm:
-    """Read an exported file back, for comparison.
+    """Read an exported URDF or MJCF back: chain, bodies, armature, damping and dry friction, for comparison.
 
     Args:
         file: the exported file.

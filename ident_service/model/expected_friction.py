@@ -37,13 +37,13 @@ class ExpectedFriction:
     offset: Array
 
     def at_joints(self, chain: Chain) -> ExpectedFriction:
-        """Return the most of it that each joint feels, of whichever drives move it."""
+        """Return the largest friction that each joint can feel, summed over all drives that move it."""
         moves = np.abs(chain.coupling)
         return ExpectedFriction(self.coulomb @ moves, np.diag((moves.T * self.viscous) @ moves), self.offset @ moves)
 
 
 def expected_friction(model: ArmModel, limits: MotionLimits, guess: tuple[float, float]) -> ExpectedFriction:
-    """Return the prior's friction, or, for drives of which it has none, the guess.
+    """Return each drive's friction: the prior's where it has any, else the guess from torque and velocity limits.
 
     Args:
         model: of the arm.
@@ -96,6 +96,6 @@ class FrictionFeedforward:
 
 
 def friction_feedforward(model: ArmModel, limits: MotionLimits) -> FrictionFeedforward:
-    """Return the feed-forward of an arm's description."""
+    """Build the friction feed-forward that the description asks for, from the prior's or guessed friction."""
     friction = expected_friction(model, limits, model.config.design.friction_guess)
     return FrictionFeedforward(friction, model.config.control.friction_feedforward, model.chain, limits)

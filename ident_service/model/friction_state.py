@@ -21,7 +21,7 @@ from ident_service.model.chain import Array
 
 
 def presliding_distances(model: ArmModel) -> Array:
-    """Return the pre-sliding distance x0 per drive [rad or m], shape (joints,).
+    """Return the pre-sliding distance x0 per drive [rad or m], shape (joints,); zero where none applies.
 
     Zero where dry friction turns round at once: nothing was fitted, or the arm has no dry friction.
     """
@@ -32,7 +32,7 @@ def presliding_distances(model: ArmModel) -> Array:
 
 
 def advance_dahl_state(direction: Array, step: Array, lengths: Array) -> Array:
-    """Return the direction of dry friction after a step.
+    """Return the dry-friction direction of each drive, -1 to 1, after a step without reversal (Dahl 1968).
 
     Args:
         direction: direction before the step, between -1 and 1, shape (..., drives).
@@ -48,16 +48,13 @@ def advance_dahl_state(direction: Array, step: Array, lengths: Array) -> Array:
 
 
 def friction_direction(rate: Array, period: float, presliding: Array, start: Array | None = None) -> Array:
-    """Return the direction of friction of each drive, between -1 and 1.
+    """Return the dry-friction direction of each drive at each sample, -1 to 1, shape (samples, drives).
 
     Args:
         rate: drive velocities [rad/s or m/s], shape (samples, drives).
         period: of the samples [s].
         presliding: x0 per drive [rad or m], shape (drives,); 0 for the sign itself.
         start: direction before the first sample, shape (drives,); the first sign that follows when None.
-
-    Returns:
-        Shape (samples, drives).
     """
     result = np.empty_like(rate)
     for drive, x0 in enumerate(presliding):

@@ -45,7 +45,7 @@ class Information:
         return len(self.factors)
 
     def merged(self, other: Information) -> Information:
-        """Return the information of both sets of equations together.
+        """Return the information of both sets of equations together; raises ModelError for different models.
 
         Raises:
             ModelError: the two belong to different models.
@@ -56,7 +56,7 @@ class Information:
 
     @staticmethod
     def sum(parts: Iterable[Information]) -> Information:
-        """Merge any number of sets of equations, at least one, by one decomposition a joint.
+        """Merge any number of sets of equations, at least one, into one; raises ModelError for different models.
 
         Raises:
             ModelError: they belong to different models.
@@ -72,7 +72,7 @@ class Information:
         return Information(first.supports, factors, rows, first.base)
 
     def require_same(self, other: Information) -> None:
-        """Refuse information of another model.
+        """Raise ModelError unless the other has as many base parameters and joints.
 
         Raises:
             ModelError: it is.
@@ -114,12 +114,12 @@ class Information:
         return np.array([float(error @ error) for error in errors])
 
     def times(self, weights: Array) -> Information:
-        """Return the equations with each joint's rows multiplied by `weights`, shape (joints,)."""
+        """Return a copy with each joint's equations multiplied by `weights`, shape (joints,)."""
         factors = tuple(weight * factor for weight, factor in zip(weights, self.factors, strict=True))
         return Information(self.supports, factors, self.rows.copy(), self.base)
 
     def with_torques_times(self, scales: Array) -> Information:
-        """Return the equations with each joint's torque multiplied by `scales`, shape (joints,)."""
+        """Return a copy with each joint's torque multiplied by `scales`, shape (joints,)."""
         factors = []
         for scale, factor in zip(scales, self.factors, strict=True):
             scaled = factor.copy()
@@ -152,7 +152,7 @@ def _stacked(factors: Sequence[Array]) -> Array:
 
 
 def triangle(rows: Array) -> Array:
-    """Return R of a QR decomposition, with arbitrary signs."""
+    """Return the triangular factor R of a QR decomposition of `rows`; its rows have arbitrary signs."""
     count, size = rows.shape
     if count < size:
         return np.asarray(np.linalg.qr(rows, mode="r"))
@@ -165,7 +165,10 @@ def triangle(rows: Array) -> Array:
 
 
 def sparsity(chain: Chain, layout: Layout, base_columns: NDArray[np.intp]) -> tuple[NDArray[np.intp], ...]:
-    """Return per joint the base columns of the links that it carries and the joint terms of drives that move it."""
+    """Return per joint the indices of the base parameters that its torque can depend on, increasing.
+
+    They are those of the links that it carries, and the joint terms of the drives that move it.
+    """
     links = base_columns // layout.per_link
     own_term = base_columns % layout.per_link >= len(INERTIAL)
     felt = []
@@ -176,7 +179,7 @@ def sparsity(chain: Chain, layout: Layout, base_columns: NDArray[np.intp]) -> tu
 
 
 def empty_information(joint_supports: tuple[NDArray[np.intp], ...], base: int) -> Information:
-    """Return the information of no equations."""
+    """Return information that holds no equations, to merge others into."""
     factors = tuple(np.zeros((0, len(support) + 1)) for support in joint_supports)
     return Information(joint_supports, factors, np.zeros(len(joint_supports), dtype=np.int64), base)
 
@@ -188,13 +191,13 @@ def information_of(
     joint_supports: tuple[NDArray[np.intp], ...],
     row_weights: Array | None = None,
 ) -> Information:
-    """Return the information of one block of samples.
+    """Compress the equations of a block of samples into a triangle per joint.
 
     Args:
         H_b: base regressor, shape (joints, base, samples).
         torque: [N m or N], shape (samples, joints).
         keep: mask of the equations that count, shape (samples, joints).
-        joint_supports: result of `supports`.
+        joint_supports: result of `sparsity`.
         row_weights: factors of the equations, shape (samples, joints); ones when None.
     """
     factors = []

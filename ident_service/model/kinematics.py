@@ -8,7 +8,7 @@ from ident_service.model.chain import WORLD, Array, Chain
 
 
 def frame_origins(chain: Chain, position: Array) -> Array:
-    """Return the origins of the base, joint and link frames along the arm.
+    """Return the origins of base, joint and link frames in the base frame [m], shape (postures, 1 + 2 joints, 3).
 
     Args:
         chain: the mechanism.
@@ -25,7 +25,7 @@ def frame_origins(chain: Chain, position: Array) -> Array:
 
 
 def joint_frames(chain: Chain, position: Array) -> tuple[Array, Array]:
-    """Return orientation and origin of every joint frame in the base frame, where its link's solids stand still.
+    """Return rotation and origin [m] of every joint frame in the base frame; its link's solids do not move in it.
 
     Args:
         chain: the mechanism.
@@ -40,7 +40,7 @@ def joint_frames(chain: Chain, position: Array) -> tuple[Array, Array]:
 
 
 def link_poses(chain: Chain, position: Array) -> tuple[Array, Array]:
-    """Return orientation and origin of every link frame in the base frame.
+    """Return rotation and origin [m] of every link frame in the base frame, at each posture.
 
     Args:
         chain: the mechanism.
@@ -78,7 +78,7 @@ def joint_poses(chain: Chain, position: Array) -> list[tuple[Array, Array]]:
 
 
 def branches(chain: Chain) -> tuple[tuple[int, ...], ...]:
-    """Return per branch of the arm the points of `frame_origins` from the base to its end."""
+    """Return per branch of the arm the indices into `frame_origins`' points, from the base to the branch's end."""
     ends = set(range(chain.joints)) - set(chain.parents)
     return tuple(
         (0, *(point for k in chain.ancestors(end) for point in (1 + 2 * k, 2 + 2 * k))) for end in sorted(ends)

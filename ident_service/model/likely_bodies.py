@@ -48,7 +48,7 @@ class LikelyBodies:
 
 
 def likely_bodies(model: ArmModel) -> LikelyBodies:
-    """Return the likely bodies of an arm's links.
+    """Return likely inertial parameters of all links: the prior's where it is a real body, else of rods.
 
     A link whose prior is a real body has that one. Any other is a rod, of the description's capsules where it has some,
     else along the lines from its joint to the next ones, with the bounds of its mass and of the arm's kept.
@@ -97,7 +97,7 @@ def likely_load(mass: float, center: Array) -> Array:
 
 
 def with_file_bodies(model: ArmModel) -> ArmModel:
-    """Return the model with every body of its URDF or MJCF as its prior, also those that no real link could have."""
+    """Return the model whose prior is the bodies of its URDF or MJCF, real or not; unchanged for a DH table."""
     kinematics = model.config.kinematics
     file = kinematics.urdf or kinematics.mjcf
     if file is None:
@@ -131,7 +131,7 @@ def _drives(model: ArmModel, delta: Array) -> Array:
 
 
 def lines_of(model: ArmModel, link: int) -> Sequence[Capsule]:
-    """Return capsules from a link's joint to the joints that it carries, in the link's frame.
+    """Return capsules (rods) from a link's joint to the joints that it carries, in the link's frame.
 
     Args:
         model: of the arm.
@@ -173,7 +173,7 @@ def _is_body(parameters: Array) -> bool:
 
 
 def perturbed_body(parameters: Array, rng: np.random.Generator) -> Array:
-    """Draw a real body about another one: A P A^T with A near the identity, so masses within about a tenth.
+    """Return a random real body near another one, shape (10,): A P A^T, A near identity, mass within about 10 %.
 
     Args:
         parameters: of a real body, shape (10,), see `INERTIAL`.

@@ -19,7 +19,7 @@ from ident_service.errors import ModelError
 
 
 def own_module(module: str, *words: str) -> tuple[list[str], dict[str, str]]:
-    """Return command and environment of an interpreter that runs one of our modules.
+    """Return command and environment to run one of our modules in a new Python interpreter; start nothing.
 
     What this interpreter finds where, the other one finds there too, and never in the working directory first.
     """
@@ -29,7 +29,7 @@ def own_module(module: str, *words: str) -> tuple[list[str], dict[str, str]]:
 
 
 def run_limited_process(module: str, path: Path, deadline: float, *more: str) -> dict[str, Any]:
-    """Run a module on a file and return what it answers.
+    """Run a module on a file in a process with limits; return the JSON object that it prints.
 
     Args:
         module: module whose `main` calls `answer_within`.
@@ -66,7 +66,7 @@ _PR_SET_PDEATHSIG = 1  # of prctl(2)
 
 
 def end_with_input() -> None:
-    """Kill this process as soon as its standard input ends, as a pipe does with the process at its other end."""
+    """Start a thread that kills this process (SIGKILL) as soon as its standard input ends; return at once."""
     os.environ.pop(ENDS_WITH_INPUT, None)  # of this command, and not of what it starts
 
     def wait() -> None:
@@ -79,7 +79,7 @@ def end_with_input() -> None:
 
 
 def end_with_parent(parent: int) -> None:
-    """Have the kernel kill this process when the thread that started it ends, which a killed process's threads do.
+    """Have the kernel kill this process (SIGKILL) when the thread that started it ends; exit if it has ended.
 
     Args:
         parent: id of the process that started this one; if that is gone already, this one ends at once.
@@ -90,7 +90,7 @@ def end_with_parent(parent: int) -> None:
 
 
 def answer_within(memory: int, seconds: int, document: Callable[[], dict[str, Any]]) -> int:
-    """Limit this process, then print what `document` returns, without anything that libraries print.
+    """Limit memory and computing time of this process, print `document()` as JSON alone, and return 0.
 
     Args:
         memory: bytes of addresses that it may have, libraries included.

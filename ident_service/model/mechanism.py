@@ -76,7 +76,7 @@ class Mechanism:
 
 
 def read_mechanism(file: TextFile, kind: Kind, kinematics: Kinematics | None = None, *, own: bool = False) -> Mechanism:
-    """Read the arm in a file.
+    """Read the arm's mechanism from URDF or MJCF text; raises ModelError where it is refused or has no such part.
 
     Args:
         file: name and text of the file.
@@ -111,7 +111,7 @@ def _read(file: TextFile, kind: Kind, part: str | None, own: bool) -> Mechanism:
 
 
 def require_parser_limits(file: TextFile, kind: Kind) -> None:
-    """Refuse a file that could break its parser, by its size, elements and links.
+    """Raise ModelError for a file that could break its parser: by size, XML, elements, links or includes.
 
     Raises:
         ModelError: not XML, too large, too many or too deeply nested elements or links, two joints that carry one
@@ -133,7 +133,9 @@ def require_parser_limits(file: TextFile, kind: Kind) -> None:
 
 
 def require_urdf(file: TextFile) -> None:
-    """Refuse a URDF that its parser would refuse, in words and with lines; `require_parser_limits` comes first.
+    """Raise ModelError with line numbers for mistakes in a URDF's robot, links and joints; return nothing.
+
+    `require_parser_limits` comes first.
 
     The parser, urdfdom, tells a terminal about its own source code, and its caller nothing.
 
@@ -332,7 +334,7 @@ class BadInertia:
 
 
 def bad_inertias(file: TextFile) -> list[BadInertia]:
-    """Find links of a URDF, one that its parser accepts, with masses or inertias that no link has."""
+    """Return the links of a URDF with masses or inertias that no real link has, each with its line; empty for none."""
     found: list[BadInertia] = []
     link, inside = "", False
     parser = expat.ParserCreate("utf-8")

@@ -53,7 +53,7 @@ class Mimic:
 
 
 def mimics(file: TextFile) -> dict[str, Mimic]:
-    """Read the `<mimic>` elements of a URDF that pinocchio has accepted, by the name of their joint.
+    """Return the `<mimic>` elements of a URDF, by the name of the joint that follows.
 
     Raises:
         ModelError: XML that pinocchio's lenient reader accepts and a strict one does not.
@@ -73,7 +73,7 @@ def mimics(file: TextFile) -> dict[str, Mimic]:
 def arm_part(
     model: pin.Model, part: ArmSelection, followers: Mapping[str, Mimic], file: str
 ) -> tuple[pin.Model, dict[str, float]]:
-    """Return the arm's part of a mechanism, and where its locked joints stand.
+    """Return the arm's part of a pinocchio model, and the positions at which all other joints are held.
 
     Args:
         model: model of the whole mechanism; joints that mimic others are joints of their own.
@@ -210,12 +210,12 @@ _UNSUPPORTED = ("JointModelPlanar",)
 
 
 def urdf_document(file: TextFile, part: str | None) -> dict[str, Any]:
-    """Read the arm in a URDF that keeps the parser's limits; `part` is JSON of a `Part`, all of it when None."""
+    """Return the arm of a URDF as JSON values; `part` is JSON of `base`, `tip` and `lock`, all of it when None."""
     return _document("URDF", lambda: pin.buildModelFromXML(file.text), part or "{}", lambda: mimics(file))
 
 
 def mjcf_document(path: str, part: str | None) -> dict[str, Any]:
-    """Return the arm of an MJCF, in a folder of its own, as JSON values; `part` selects it, as in a URDF."""
+    """Return the arm of an MJCF, alone in its folder, as JSON values; `part` selects it as for a URDF."""
     text, unknown = Path(path).read_text(encoding="utf-8-sig"), set[str]()
 
     def build() -> pin.Model:
@@ -228,7 +228,7 @@ def mjcf_document(path: str, part: str | None) -> dict[str, Any]:
 
 
 def delta_from_inertia(inertia: pin.Inertia) -> NDArray[np.float64]:
-    """Return the ten parameters of eq. 13 about the origin of the frame the inertia is expressed in, shape (10,)."""
+    """Return the ten parameters (eq. 13) of a pinocchio inertia, about the origin of its frame, shape (10,)."""
     m, mx, my, mz, xx, xy, yy, xz, yz, zz = inertia.toDynamicParameters()
     return np.array([xx, xy, xz, yy, yz, zz, mx, my, mz, m])
 
@@ -294,7 +294,7 @@ def _document(
 
 
 def main(words: list[str]) -> int:
-    """Read one MJCF file within the limits of memory and time, and print it as JSON."""
+    """Read one MJCF file, within limits of memory and time, and print its mechanism as JSON; return 0."""
     return answer_within(MOST_MEMORY, MOST_SECONDS, lambda: mjcf_document(words[0], words[1] if words[1:] else None))
 
 

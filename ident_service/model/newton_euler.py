@@ -30,12 +30,12 @@ ZERO: Vector = [0.0, 0.0, 0.0]
 
 
 def to_vector(values: Array) -> Vector:
-    """Return numbers as a vector, shape (3,)."""
+    """Return an array of three numbers as a list of floats."""
     return [float(value) for value in values]
 
 
 def turned(placement: Array, axis: Array, c: Symbol, s: Symbol) -> Rotation:
-    """Return the rows of the rotation from the parent's frame into the turned joint frame (Rodrigues, transposed)."""
+    """Return the rotation from the parent's frame into the turned joint frame, as rows of symbolic values."""
     x, y, z = (float(component) for component in axis)
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     still, sine, cosine = placement @ (np.eye(3) + K @ K), placement @ K, -(placement @ (K @ K))
@@ -45,12 +45,12 @@ def turned(placement: Array, axis: Array, c: Symbol, s: Symbol) -> Rotation:
 
 
 def dot(a: Vector, b: Vector) -> Value:
-    """Return the dot product."""
+    """Return the dot product of two vectors of numbers or symbolic values."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def rotate(rotation: Rotation, vector: Vector) -> Vector:
-    """Return the product of a rotation, by rows, and a vector."""
+    """Return the product of a rotation, given by rows, and a vector."""
     return [dot(row, vector) for row in rotation]
 
 
@@ -90,7 +90,7 @@ def rigid_torque(
     q: Sequence[Symbol],
     *rates: Sequence[Value],
 ) -> list[Value]:
-    """Return the torque of the links: M(q) ddq + c(q, dq) + g(q) without drives.
+    """Return the links' joint torques as symbolic values: M(q) ddq + c(q, dq) + g(q); without rates only g(q).
 
     Args:
         tape: graph that the formulas are recorded in.
@@ -122,7 +122,7 @@ def rigid_torque(
 def mass_matrix(
     tape: ExpressionGraph, chain: Chain, layout: Layout, parameters: Parameters, q: Sequence[Symbol]
 ) -> list[list[Value]]:
-    """Return M(q), drive inertia included, by composite bodies, which every joint towards the base carries."""
+    """Return M(q) as symbolic rows, drive inertia included, by the composite-body algorithm."""
     n = chain.joints
     steps = [_Step(tape, chain, k, q) for k in range(n)]
     composite = [
@@ -156,7 +156,7 @@ def mass_matrix(
 
 
 def drive_torque(chain: Chain, layout: Layout, parameters: Parameters, ddq: Sequence[Value]) -> list[Value]:
-    """Return the torque that accelerates the drives, in the rows of the joints they move."""
+    """Return the torque of each joint that accelerates the drives' own inertia, as symbolic values."""
     torque: list[Value] = [0.0] * chain.joints
     for drive, column in enumerate(layout.term_columns("drive_inertia")):
         share = to_vector(chain.coupling[drive])
@@ -173,7 +173,7 @@ def friction_torque(
     dq: Sequence[Symbol],
     direction: Sequence[Symbol] | None = None,
 ) -> list[Value]:
-    """Return the friction torque; `direction` per drive is the sign of its velocity when None."""
+    """Return the friction torque of each joint; dry friction takes the velocity's sign where `direction` is None."""
     torque: list[Value] = [0.0] * chain.joints
     columns = {term: layout.term_columns(term) for term in layout.terms}
     for drive in range(chain.joints):

@@ -35,7 +35,7 @@ _NAME = re.compile(r"(?<![\w.])[A-Za-z_]\w*")
 
 
 def translate(text: str, notation: Notation) -> str:
-    """Rename all parameters of an expression to our notation.
+    """Return an expression with all parameter names changed to ours; raises ParameterError for an unknown name.
 
     Raises:
         ParameterError: a name that the notation does not have.
@@ -44,7 +44,7 @@ def translate(text: str, notation: Notation) -> str:
 
 
 def regrouped(text: str, notation: Notation) -> tuple[str, ...]:
-    """List the names of an expression that are marked as regrouped."""
+    """Return the names in an expression that Khalil's notation marks as regrouped; empty for other notations."""
     if notation != "khalil":
         return ()
     matches = (_KHALIL_NAME.fullmatch(name) for name in _NAME.findall(text))

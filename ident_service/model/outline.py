@@ -133,7 +133,7 @@ class Source:
 
 
 def read_source(path: Path, convention: str | None = None) -> Source:
-    """Read the file that a description is made from.
+    """Read a URDF, MJCF or DH table into what a first description is made from; raises on any mistake.
 
     Args:
         path: a URDF (`.urdf`, `.xml`), an MJCF (`.xml`), or a DH table (`.csv`, `.yaml`).
@@ -298,7 +298,7 @@ def _table(
 
 
 def urdf_outline(text: str, folder: Path) -> Outline:
-    """Read the outline of a URDF that has passed `require_parser_limits`.
+    """Read tree, limits and collision capsules from a URDF that has passed `require_parser_limits`.
 
     Args:
         text: of the file.
@@ -346,7 +346,7 @@ def _urdf_limits(joint: ET.Element) -> FileLimits:
 def plausible_limits(
     position: tuple[float | None, float | None] | None, velocity: float | None, effort: float | None
 ) -> FileLimits:
-    """Return limits without those that are none, or no arm's."""
+    """Return limits with None for empty ranges, and for velocities or efforts not positive or beyond any arm's."""
     lower, upper = position or (None, None)
     ranged = lower is not None and upper is not None and lower < upper
     return FileLimits(
@@ -441,7 +441,7 @@ def _find(name: str, folder: Path) -> Path | None:
 
 
 def capsules_around(corners: Array) -> list[Capsule]:
-    """Enclose triangles in a capsule, or in up to four where they take clearly less space.
+    """Return capsules that enclose triangles: one, or up to four where these take clearly less space.
 
     Args:
         corners: of the triangles [m], shape (triangles, 3, 3).
@@ -510,7 +510,7 @@ def _volume(capsule: Capsule) -> float:
 
 
 def capsule_around(points: Array) -> Capsule:
-    """Enclose points [m], shape (points, 3), in a capsule along their longest direction."""
+    """Return a capsule, along the points' longest direction, that encloses points [m], shape (points, 3)."""
     center = 0.5 * (points.min(axis=0) + points.max(axis=0))
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     local = (points - center) @ axes.T
@@ -532,7 +532,7 @@ def _rounded(start: Array, end: Array, radius: float) -> Capsule:
 
 
 def arm_capsules(outline: Outline, kinematics: Kinematics, chain: Chain) -> tuple[dict[str, list[Capsule]], list[str]]:
-    """Return the capsules of the arm's links in the frames of a description.
+    """Return capsules of the arm's links by joint name or `base`, and names of those with an unreadable mesh.
 
     Args:
         outline: of the file.
@@ -584,7 +584,7 @@ def _around_both(one: Capsule, other: Capsule) -> Capsule:
 
 
 def arm_part(outline: Outline, file: str, base: str | None, tip: str | None) -> dict[str, str]:
-    """Return which part of a file is the arm: from the root along the branch with most joints to its gripper.
+    """Return `base` and `tip` of the arm in a file, where needed: the branch with most joints, up to a gripper.
 
     A hand begins where branches part that reach not far, or have too few joints for an arm, or at a joint that others
     mimic. Where a head or a second arm hangs beside an arm, what carries both is no part of it.
@@ -639,7 +639,7 @@ def arm_part(outline: Outline, file: str, base: str | None, tip: str | None) -> 
 
 
 def mjcf_outline(path: Path) -> Outline:
-    """Read the outline of an MJCF, and of the meshes that it names.
+    """Read tree, limits and collision capsules from an MJCF, in a process with limits.
 
     Raises:
         ModelError: it cannot be read.
@@ -799,7 +799,7 @@ def _surface(solid: Any) -> Array | None:
 
 
 def main(words: list[str]) -> int:
-    """Read the outline of one MJCF within the limits of memory and time, and print it as JSON."""
+    """Read the outline of one MJCF, within limits of memory and time, and print it as JSON; return 0."""
     return answer_within(_MOST_MEMORY, _MOST_SECONDS, lambda: _mjcf_document(Path(words[0]), Path(words[1])))
 
 

@@ -58,7 +58,7 @@ def inertia_matrix(parameters: Array) -> Array:
 
 
 def body_parameters(inertia: Array, first: Array, mass: float) -> Array:
-    """Return the parameters of eq. 13 of a body, shape (10,).
+    """Return the ten parameters of a body (eq. 13), shape (10,), in the order of `INERTIAL`.
 
     Args:
         inertia: inertia about the frame's origin [kg m^2], shape (3, 3).
@@ -69,7 +69,7 @@ def body_parameters(inertia: Array, first: Array, mass: float) -> Array:
 
 
 def pseudo_inertia(parameters: Array) -> Array:
-    """Return the second moments of a body's mass, shape (4, 4); positive definite for real bodies.
+    """Return the pseudo-inertia matrix of a body, shape (4, 4); positive definite for real bodies.
 
     Args:
         parameters: of eq. 13, shape (10,).
@@ -129,18 +129,18 @@ class Layout:
 
     @property
     def size(self) -> int:
-        """Return the number of parameters of the arm, n in the paper."""
+        """Return the number of link parameters of the whole arm, n in the paper."""
         return self.per_link * self.joints
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Return all names, `Lxx1 ... foN`."""
+        """Return the names of all link parameters, `Lxx1 ... foN`, in the order of delta."""
         symbols = INERTIAL + tuple(TERM_SYMBOLS[term] for term in self.terms)
         return tuple(f"{symbol}{link}" for link in range(1, self.joints + 1) for symbol in symbols)
 
     @cached_property
     def units(self) -> tuple[str, ...]:
-        """Return the unit of each parameter."""
+        """Return the unit of each link parameter, in the order of delta."""
         units: list[str] = []
         for revolute in self.revolute:
             table = _REVOLUTE_UNITS if revolute else _PRISMATIC_UNITS
@@ -148,12 +148,12 @@ class Layout:
         return tuple(units)
 
     def inertial(self, link: int) -> slice:
-        """Return the columns of the ten inertial parameters of `link` (counted from 0)."""
+        """Return the slice of delta with the ten inertial parameters of `link` (counted from 0)."""
         start = link * self.per_link
         return slice(start, start + len(INERTIAL))
 
     def term_columns(self, term: JointTerm) -> NDArray[np.intp]:
-        """Return the columns of one joint term, shape (joints,), or empty where the model has no such term."""
+        """Return the indices in delta of one joint term, shape (joints,); empty where the model has no such term."""
         if term not in self.terms:
             return np.zeros(0, dtype=np.intp)
         return np.arange(self.joints) * self.per_link + len(INERTIAL) + self.terms.index(term)
@@ -200,18 +200,18 @@ class JointDrives:
     friction: Array
 
     def of(self, term: JointTerm) -> Array:
-        """Return the values of one of `JOINT_TERMS`, shape (joints,)."""
+        """Return the values of `drive_inertia`, `viscous` or `coulomb` at each joint, shape (joints,)."""
         return {"drive_inertia": self.armature, "viscous": self.damping, "coulomb": self.friction}[term]
 
 
 def own_drives(chain: Chain) -> NDArray[np.bool_]:
-    """Return which joints have a drive that moves no other joint, and are moved by no other drive, shape (joints,)."""
+    """Return a mask of the joints moved by one drive alone that moves no other joint, shape (joints,)."""
     shared = (chain.coupling != 0.0) & ~np.eye(chain.joints, dtype=bool)
     return np.asarray(~(shared.any(axis=0) | shared.any(axis=1)))
 
 
 def joint_drives(chain: Chain, layout: Layout, delta: Array) -> JointDrives:
-    """Return the inertia, damping and dry friction that each joint's own drive adds to it.
+    """Return inertia, damping and dry friction that each joint's own drive adds to it; zero for shared drives.
 
     Args:
         chain: the mechanism.

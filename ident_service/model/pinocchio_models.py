@@ -42,12 +42,12 @@ def read_urdf(
 def read_mjcf(
     file: TextFile, gravity: tuple[float, float, float], kinematics: Kinematics | None = None
 ) -> tuple[Chain, Array]:
-    """Read chain and link inertias from an MJCF file of hinge and slide joints, as `read_urdf`."""
+    """Read chain and link inertias (joints, 10) from an MJCF; fixed joints, and held ones, are merged."""
     return chain_of(read_mechanism(file, "mjcf", kinematics), gravity)
 
 
 def chain_of(mechanism: Mechanism, gravity: tuple[float, float, float]) -> tuple[Chain, Array]:
-    """Return chain and link inertias of a mechanism, as `read_urdf` does of a file."""
+    """Return the chain of a mechanism with this gravity, and its link inertias, shape (joints, 10)."""
     n = len(mechanism.names)
     chain = Chain(
         names=mechanism.names,
@@ -64,7 +64,7 @@ def chain_of(mechanism: Mechanism, gravity: tuple[float, float, float]) -> tuple
 
 
 def inertia_from_delta(parameters: Array) -> pin.Inertia:
-    """Return the inertia of the ten parameters of eq. 13; `parameters` shape (10,), with positive mass.
+    """Return the pinocchio inertia of ten parameters (eq. 13); raises ModelError where mass is not positive.
 
     Raises:
         ModelError: the mass is not positive, so that no centre of mass exists.
@@ -76,7 +76,7 @@ def inertia_from_delta(parameters: Array) -> pin.Inertia:
 
 
 def quaternion(rotation: Array) -> Array:
-    """Return w, x, y, z of a rotation, w >= 0, shape (4,)."""
+    """Return the unit quaternion (w, x, y, z) of a rotation matrix, with w >= 0, shape (4,)."""
     x, y, z, w = pin.Quaternion(rotation).coeffs()
     return np.array([w, x, y, z]) if w >= 0.0 else -np.array([w, x, y, z])
 
@@ -87,13 +87,13 @@ def link_frame(chain: Chain, link: int) -> pin.SE3:
 
 
 def pinocchio_model(chain: Chain, layout: Layout, delta: Array) -> pin.Model:
-    """Return a pinocchio model of the chain with the inertias of `delta` and its drive inertias as armature.
+    """Build a pinocchio model with the inertias of `delta`, and drive inertias as armature; without friction.
 
     Every joint has one position coordinate, continuous joints too. Friction stays with whoever integrates, because
     pinocchio's has no sticking.
 
     Raises:
-        ModelError: `delta` does not fit the layout, or a link has no positive mass.
+        ModelError: `delta` does not fit the layout, a link has no positive mass, or a drive moves several joints.
     """
     if delta.shape != (layout.size,):
         raise ModelError(f"{delta.shape=} but the layout has {layout.size} parameters")
@@ -133,7 +133,7 @@ class InverseDynamics:
         self._data = self._model.createData()
 
     def torque(self, position: Array, velocity: Array, acceleration: Array) -> NDArray[np.float64]:
-        """Return `M(q) ddq + c(q, dq) + g(q)` [N m or N], shape (joints,), drive inertia included."""
+        """Return `M(q) ddq + c(q, dq) + g(q)` [N m or N], shape (joints,), drive inertia included, no friction."""
         rigid = np.asarray(pin.rnea(self._model, self._data, position, velocity, acceleration))
         return rigid if self._drives is None else np.asarray(rigid + self._drives @ acceleration)
 
@@ -192,7 +192,7 @@ class ForwardDynamics:
         return np.asarray(rigid + self._drive_matrix @ acceleration)
 
     def mass_matrices(self, position: Array) -> NDArray[np.float64]:
-        """Return M(q) at postures [rad or m] (samples, joints); (samples, joints, joints), drive inertia included."""
+        """Return M(q) at postures [rad or m] of shape (samples, joints), as (samples, joints, joints), with drives."""
         n = self._model.nv
         M = np.empty((len(position), n, n))
         for k, posture in enumerate(position):
@@ -202,12 +202,12 @@ class ForwardDynamics:
         return np.asarray(M + self._drive_matrix)
 
     def friction(self, velocity: Array) -> NDArray[np.float64]:
-        """Return the friction torque [N m or N], shape (joints,)."""
+        """Return the friction torque [N m or N], offsets included, shape (joints,), of a joint velocity."""
         rate = self._coupling @ velocity
         return np.asarray(self._coupling.T @ (self._secant(rate) * rate) + self._offset)
 
     def next_velocity(self, position: Array, velocity: Array, torque: Array, period: float) -> NDArray[np.float64]:
-        """Return the velocity after one step of a constant torque, implicit in the friction, explicit in the rest.
+        """Return the joint velocity after one step of constant torque, implicit in friction, explicit in the rest.
 
         Args:
             position: [rad or m], shape (joints,).

@@ -32,7 +32,7 @@ _UNWRITTEN: Final = ("replicate", "attach", "composite", "flexcomp")  # elements
 
 
 def build_from_mjcf(path: Path, folder: Path, build: Callable[[str], Any], meshes: Path | None = None) -> Any:
-    """Rewrite an MJCF into a folder and return what `build` makes of the new file.
+    """Write an MJCF, rewritten for pinocchio's reader, into a folder; return what `build` makes of that file.
 
     Args:
         path: of an MJCF that has passed `require_parser_limits`.
@@ -50,7 +50,7 @@ def build_from_mjcf(path: Path, folder: Path, build: Callable[[str], Any], meshe
 
 
 def plain_mjcf(text: str, meshes: Path | None = None) -> str:
-    """Return an MJCF in radians, without classes and frames; see `build_from_mjcf`."""
+    """Return an MJCF rewritten in radians, without classes and frames; raises ModelError for what cannot be."""
     root = parse_xml(text)
     if root.tag != "mujoco":
         return text
@@ -95,7 +95,7 @@ def _weighs_as_mesh(geom: ET.Element) -> bool:
 
 
 def mjcf_gravity(text: str) -> tuple[float, float, float]:
-    """Return the gravity of an MJCF in the frame of its world [m/s^2].
+    """Return the gravity of an MJCF in its world frame [m/s^2]; zeros where disabled, MuJoCo's default if unsaid.
 
     Raises:
         ModelError: it is not three numbers.

@@ -46,7 +46,7 @@ def joint_regressor(
     out: Array | None = None,
     direction: Array | None = None,
 ) -> Array:
-    """Return the rows of H for every joint and sample.
+    """Return the regressor H, shape (joints, columns, samples): joint i's torques are `H[i].T @ delta`.
 
     Args:
         chain: the mechanism.
@@ -59,9 +59,6 @@ def joint_regressor(
             which saves the time of fresh memory.
         direction: direction of Coulomb friction per drive, from -1 to 1, shape (samples, joints); the sign of the
             drive's velocity when None.
-
-    Returns:
-        H, shape (joints, columns, samples): joint i's equations are `H[i].T @ delta`.
 
     Raises:
         ModelError: the arrays have the wrong shape.
@@ -100,7 +97,7 @@ def _traced(chain: Chain, layout: Layout) -> tuple[ExpressionGraph, dict[tuple[i
 
 
 def traced_regressor(chain: Chain, layout: Layout) -> tuple[ExpressionGraph, dict[tuple[int, int], Value]]:
-    """Return the formulas of H on a fresh tape, for programs of other kinds than the one here.
+    """Return the formulas of H as an expression graph, and its nonzero entries by (joint, column of delta).
 
     Returns:
         The tape, whose inputs are position, velocity, acceleration and direction of every joint, in this order, and
@@ -125,7 +122,7 @@ def traced_rigid_torque(
     dq: Sequence[Value],
     ddq: Sequence[Value],
 ) -> list[Value]:
-    """Return the links' share of every joint's torque for known parameters; numbers in `dq` and `ddq` are folded."""
+    """Return symbolic torques of the links for known parameters, without drives and friction, one per joint."""
     torque: list[Value] = [0.0] * chain.joints
     states = _Forward(tape, chain, q, dq, ddq)
     for link in range(chain.joints):
@@ -137,7 +134,7 @@ def traced_rigid_torque(
 
 
 def entries_of(entries: dict[tuple[int, int], Value], columns: Sequence[int]) -> dict[tuple[int, int], Value]:
-    """Return the entries that are not zero, by joint and place in `columns`."""
+    """Return the entries of H that are not zero, by (joint, place in `columns`)."""
     chosen = {column: row for row, column in enumerate(columns)}
     return {
         (joint, chosen[column]): value
@@ -290,7 +287,7 @@ class RegressorGradient:
         self._H = np.zeros((0, 0, 0))
 
     def run(self, position: Array, velocity: Array, acceleration: Array, direction: Array) -> Array:
-        """Return the rows of H.
+        """Return the regressor H, shape (joints, columns, samples), and keep its values for `pull`.
 
         Args:
             position: [rad or m], shape (samples, joints).

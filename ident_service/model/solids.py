@@ -54,7 +54,7 @@ SIGNS = np.array(list(product((-1.0, 1.0), repeat=3)))  # of the corners of a bo
 
 
 def corners(solid: Solid) -> tuple[Array, float]:
-    """Return points whose convex hull, made thicker by a radius, contains a solid that has an end.
+    """Return points and a radius: the points' convex hull, thicker by the radius, contains the solid.
 
     Returns:
         Points in the solid's frame [m], shape (points, 3), and the radius [m].

@@ -78,15 +78,15 @@ class ExpressionGraph:
         self._known: dict[tuple[object, ...], Symbol] = {}
 
     def input(self) -> Symbol:
-        """Record a value that is given when the program runs, in the order of these calls."""
+        """Record an input and return its symbol; inputs are given in the order of these calls when evaluated."""
         return self.step("input", len(self.steps), None)
 
     def apply(self, function: str, value: Symbol) -> Symbol:
-        """Record `sin`, `cos`, `exp`, `abs` or `sign` of a value."""
+        """Record `sin`, `cos`, `exp`, `abs` or `sign` of a value, and return the result's symbol."""
         return self.step(function, value.index, None)
 
     def step(self, operation: str, a: _Operand, b: _Operand) -> Symbol:
-        """Record one operation on indices of earlier steps (int) or constants (float)."""
+        """Record an operation on earlier steps (int) or constants (float), each once; return its symbol."""
         # The types tell step 2 from the constant 2.0, which are equal.
         key = (operation, a, type(a), b, type(b))
         if (known := self._known.get(key)) is None:
@@ -154,11 +154,11 @@ class Program:
 
     @property
     def steps(self) -> int:
-        """Return the number of numpy calls per run."""
+        """Return the number of numpy operations per run."""
         return len(self._plan)
 
     def run(self, inputs: Sequence[Array], output: Sequence[Array]) -> None:
-        """Compute the outputs for arrays of inputs.
+        """Evaluate the recorded outputs for arrays of inputs, into the `output` arrays; returns nothing.
 
         Args:
             inputs: arrays of one shape, in the order of `ExpressionGraph.input` calls.
@@ -179,13 +179,13 @@ class Program:
 
 
 def operands_of(tape: ExpressionGraph, at: int) -> list[int]:
-    """Return the earlier steps that a step is made of."""
+    """Return the indices of the earlier steps that a step is computed from; empty for inputs and constants."""
     operation, a, b = tape.steps[at]
     return [] if operation == "input" else [value for value in (a, b) if isinstance(value, int)]
 
 
 def needed_steps(tape: ExpressionGraph, wanted: list[int]) -> list[int]:
-    """Return the steps that the wanted ones depend on, in order."""
+    """Return the indices of all steps that the wanted ones depend on, themselves included, increasing."""
     found: set[int] = set()
     waiting = list(wanted)
     while waiting:
@@ -221,11 +221,11 @@ class Differentiable:
 
     @property
     def steps(self) -> tuple[int, int]:
-        """Return the numbers of numpy calls per run and per pull."""
+        """Return the numbers of numpy operations per run and per pull."""
         return self._forward.steps, self._backward.steps
 
     def run(self, values: Array) -> Array:
-        """Compute the outputs, and keep the values that `pull` needs.
+        """Return the outputs, shape (outputs, samples), and keep the values that `pull` needs.
 
         Args:
             values: all inputs of the tape, shape (inputs, samples).
@@ -245,7 +245,7 @@ class Differentiable:
         return self._values[: self._outputs]
 
     def pull(self, seeds: Array) -> Array:
-        """Return the gradient of `sum(seeds * outputs)`, sample by sample, at the values of the last run.
+        """Return the gradient of `sum(seeds * outputs)` over the inputs at the last run, shape (inputs, samples).
 
         Args:
             seeds: shape (outputs, samples).
@@ -363,22 +363,22 @@ class TaylorModel:
 
     @property
     def reach(self) -> Array:
-        """Return the largest distance of the value from `c`."""
+        """Return the largest distance of the value from its middle `c`, over each time interval."""
         return np.asarray(np.abs(self.d) * self.h + self.r)
 
     @property
     def size(self) -> Array:
-        """Return the largest that `|x|` can be."""
+        """Return an upper bound of `|x|` over each time interval."""
         return np.asarray((np.abs(self.c) + self.reach) * (1.0 + _ROUNDING))
 
     @property
     def highest(self) -> Array:
-        """Return the largest that x can be."""
+        """Return an upper bound of x over each time interval."""
         return np.asarray(self.c + self.reach + _ROUNDING * np.abs(self.c))
 
     @property
     def lowest(self) -> Array:
-        """Return the smallest that x can be."""
+        """Return a lower bound of x over each time interval."""
         return np.asarray(self.c - self.reach - _ROUNDING * np.abs(self.c))
 
     def __add__(self, other: TaylorModel) -> TaylorModel:
@@ -396,15 +396,15 @@ class TaylorModel:
         return TaylorModel(self.c * other.c, self.c * other.d + self.d * other.c, r, self.h)
 
     def shifted(self, constant: float) -> TaylorModel:
-        """Return the sum of this value and a number."""
+        """Return the enclosure of this value plus a number."""
         return TaylorModel(self.c + constant, self.d, self.r, self.h)
 
     def scaled(self, constant: float) -> TaylorModel:
-        """Return the product of this value and a number."""
+        """Return the enclosure of this value times a number."""
         return TaylorModel(self.c * constant, self.d * constant, self.r * abs(constant), self.h)
 
     def function(self, name: str) -> TaylorModel:
-        """Return `sin`, `cos`, `exp`, `abs`, `sign` or `neg` of this value."""
+        """Return the enclosure of `sin`, `cos`, `exp`, `abs`, `sign` or `neg` of this value."""
         reach = self.reach
         if name == "neg":
             return -self
@@ -429,7 +429,7 @@ class TaylorModel:
 
 
 def enclose(tape: ExpressionGraph, inputs: Sequence[TaylorModel], outputs: Sequence[Value]) -> list[TaylorModel]:
-    """Run a tape on enclosures and return the enclosures of its outputs.
+    """Evaluate an expression graph on enclosures; return the enclosures of the outputs, one each.
 
     Args:
         tape: recorded expression graph.

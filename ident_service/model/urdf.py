@@ -29,7 +29,7 @@ BASE_LINK = "base_link"
 
 
 def urdf_text(model: ArmModel, delta: Array | None, visible: Sequence[Body] = ()) -> str:
-    """Return the arm as URDF text.
+    """Return the arm as URDF text: kinematics and limits, inertias of `delta`, and solids to draw.
 
     Args:
         model: the mechanism and its limits.
@@ -115,7 +115,7 @@ def _primitives(solid: Solid) -> Iterator[tuple[Array, Array, str, dict[str, str
 
 
 def rotation_to(direction: Array) -> Array:
-    """Return a rotation that takes the z axis to a direction of length one, shape (3, 3)."""
+    """Return a rotation matrix that takes the z axis to a direction of length one, shape (3, 3)."""
     first = np.cross(np.eye(3)[int(np.argmin(np.abs(direction)))], direction)
     first = first / np.linalg.norm(first)
     return np.column_stack([first, np.cross(direction, first), direction])
@@ -157,7 +157,7 @@ def _numbers(values: Array) -> str:
 
 
 def roll_pitch_yaw(rotation: Array) -> Array:
-    """Return URDF's fixed-axis angles [rad]: R = Rz(yaw) Ry(pitch) Rx(roll); exact near gimbal lock too."""
+    """Return roll, pitch, yaw [rad] about fixed axes, R = Rz(yaw) Ry(pitch) Rx(roll), also near gimbal lock."""
     yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
     # Roll and pitch of what is left after that very yaw, so that where it is arbitrary, they make up for it.
     c, s = np.cos(yaw), np.sin(yaw)
@@ -167,7 +167,7 @@ def roll_pitch_yaw(rotation: Array) -> Array:
 
 
 def urdf_solids(kinematics: Kinematics, chain: Chain, skip: frozenset[str]) -> list[Body]:
-    """Return the solids of all links but those in `skip`.
+    """Return the collision solids of a URDF's links of the arm and its base, but those in `skip`; [] without URDF.
 
     Args:
         kinematics: the URDF that the chain was read from, and which part of it is the arm.
@@ -203,7 +203,7 @@ def urdf_solids(kinematics: Kinematics, chain: Chain, skip: frozenset[str]) -> l
 
 
 def solid_of(collision: ET.Element, rotation: Array, center: Array, owner: str, where: str) -> Solid:
-    """Return the solid of a collision element at a placement in its joint's frame; `owner` and `where` for errors.
+    """Return the solid of a URDF's collision element at a placement in its joint's frame; raises for a mesh.
 
     Raises:
         ModelError: a mesh, or a shape or number that cannot be read.

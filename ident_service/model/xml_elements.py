@@ -9,7 +9,7 @@ from ident_service.errors import ModelError
 
 
 def parse_xml(text: str) -> ET.Element:
-    """Return the root of a file that has passed `require_parser_limits`; undeclared prefixes stay in names.
+    """Parse XML text that has passed `require_parser_limits`; return its root, undeclared prefixes kept in names.
 
     Tools of simulators add attributes such as `drake:acceleration`, and often do not declare their prefixes.
 

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 
 def low_pass(values: Array, order: int, cutoff: float, rate: float, pad: int | None = None) -> Array:
-    """Filter every column with a Butterworth low-pass forwards and backwards.
+    """Filter every column forwards and backwards with a Butterworth low-pass, so without phase; same shape.
 
     Each end is continued by its odd reflection, and the filter begins in the steady state of the first value, as
     Gustafsson (1996) has it for `filtfilt` in general.
@@ -49,7 +49,7 @@ def low_pass(values: Array, order: int, cutoff: float, rate: float, pad: int | N
 
 
 def butterworth_sections(order: int, cutoff: float, rate: float) -> list[tuple[float, float, float]]:
-    """Design the filter by the bilinear transform, as sections `g (1 + 1/z)^k / (1 + a1/z + a2/z^2)` of unit gain.
+    """Return the (g, a1, a2) of sections `g (1 + 1/z)^k / (1 + a1/z + a2/z^2)` of a Butterworth low-pass.
 
     Returns:
         Per section `(g, a1, a2)`; k is 2, or 1 in the last section of an odd order, where a2 is 0.
@@ -91,7 +91,7 @@ def _one_way(columns: Array, sections: list[tuple[float, float, float]]) -> Arra
 
 
 def local_polynomial(values: Array, length: int, degree: int, derivative: int, period: float) -> Array:
-    """Fit a polynomial to the samples around each sample and differentiate it (Savitzky and Golay, 1964).
+    """Return the `derivative` (0: the value) of polynomials fitted to a window around each sample (Savitzky-Golay).
 
     The first and last half window belong to the polynomials of the first and last whole window.
 
@@ -132,7 +132,7 @@ _SPLINE_REACH = 12  # samples, after which a value counts for a ten-millionth in
 
 
 def spline_shifted(values: Array, steps: float) -> Array:
-    """Return a cubic spline through samples, read a number of samples further on; its ends go on with their values.
+    """Return samples read `steps` (a fraction too) samples later, by a cubic spline; ends keep their values.
 
     Args:
         values: shape (samples, columns), at least one sample.
@@ -159,6 +159,6 @@ def spline_shifted(values: Array, steps: float) -> Array:
 
 
 def widened(marks: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
-    """Return marks on every sample that is at most `reach` samples from a marked one, shape (samples, columns)."""
+    """Return a mask of the samples at most `reach` samples from one marked in `marks`, shape (samples, columns)."""
     counts = np.cumsum(np.pad(marks, ((reach + 1, reach), (0, 0))), axis=0)
     return np.asarray(counts[2 * reach + 1 :] > counts[: len(marks)])

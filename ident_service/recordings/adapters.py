@@ -67,7 +67,7 @@ class RangeRecording:
         self.payload = payload_of(self.whole)
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
-        """Read the samples in order; see `Recording.blocks`. Blocks at the ends are shorter.
+        """Yield the samples in the range, in blocks of `samples` or shorter; raises RecordingError where it has none.
 
         Raises:
             RecordingError: no sample lies in the range; and whatever the whole recording's blocks raise.
@@ -103,7 +103,7 @@ def _stamp(first_ns: int, seconds: float) -> np.int64:
 
 
 def first_stamp(recording: Recording) -> int:
-    """Return the first stamp of the whole file [ns]."""
+    """Return the first stamp of the whole file [ns], also for a range of it; raises RecordingError if empty."""
     whole = recording.whole if isinstance(recording, RangeRecording) else recording
     for block in whole.blocks(1):
         return int(block.stamp_ns[0])
@@ -111,12 +111,12 @@ def first_stamp(recording: Recording) -> int:
 
 
 def time_range(recording: Recording) -> tuple[float, float]:
-    """Return start and end of a recording within its file [s]; minus and plus infinity for a whole one."""
+    """Return start and end of a range within its file [s]; minus and plus infinity for a whole recording."""
     return (recording.start, recording.end) if isinstance(recording, RangeRecording) else (-np.inf, np.inf)
 
 
 def driver_of(recording: Recording) -> str:
-    """Return the kind of driver that a recording of this package was made with; empty where it does not say."""
+    """Return the kind of driver, as `canopen` or `simulated`, that made a recording; empty where it does not say."""
     if isinstance(recording, McapRecording):
         # Files of earlier versions tell their clock alone; virtual time is that of simulated arms.
         virtual = recording.metadata.get("clock") == "virtual"
@@ -126,13 +126,13 @@ def driver_of(recording: Recording) -> str:
 
 
 def overlap(one: Recording, other: Recording) -> bool:
-    """Return whether two recordings share samples: those of the same file, unless their ranges do not overlap."""
+    """Return whether two recordings are of the same file (by hash) and their time ranges overlap."""
     (start, end), (other_start, other_end) = time_range(one), time_range(other)
     return one.sha256 == other.sha256 and start < other_end and other_start < end
 
 
 def without_standstill(recording: Recording, margin: float) -> RangeRecording:
-    """Return the recording without what comes before the first joint moves and after the last one has stopped.
+    """Return a range without the standstill before the first joint moves and after the last one stops.
 
     A joint moves where its mean position over 0.1 s changes by more than 0.005 rad/s or m/s to the next 0.1 s.
 
@@ -175,7 +175,7 @@ def without_standstill(recording: Recording, margin: float) -> RangeRecording:
 
 
 def without_ends(recording: Recording, trim: tuple[float, float]) -> RangeRecording:
-    """Return the recording without its first and last seconds, as `resampling.trimmed` does.
+    """Return the recording without its first and last seconds; raises RecordingError where nothing is left.
 
     Args:
         recording: recording that is read through once.
@@ -234,7 +234,7 @@ class JointSideRecording:
         self._coupling = None if transmission.coupling is None else np.array(transmission.coupling)
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
-        """Read the samples in order, converted to the joint side; see `Recording.blocks`."""
+        """Yield blocks of `samples`, in order, converted from the motor to the joint side."""
         for block in self._motors.blocks(samples):
             position, velocity, torque = block.position, block.velocity, block.torque
             if self._positions:
@@ -291,7 +291,7 @@ class MeasuredRecording:
 
     @property
     def torn(self) -> bool:
-        """Return whether the file ended in the middle of a record and was read up to there."""
+        """Return whether the file ended in the middle of a record; samples up to there are read."""
         return self.whole.torn
 
     @torn.setter
@@ -299,7 +299,7 @@ class MeasuredRecording:
         self.whole.torn = torn
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
-        """Read the samples in order; see `Recording.blocks`.
+        """Yield blocks whose torque is the one that drives measured; samples without one are left out.
 
         Raises:
             RecordingError: as the recording's, or no sample has a measured torque.

@@ -24,17 +24,17 @@ class Memory:
         self._kept: dict[str, tuple[object, Any]] = {}
 
     def recall(self, kind: str, key: object) -> Any:
-        """Return what was computed with an equal key; None where the last one of that kind was not."""
+        """Return the value remembered for `kind` if its key equals this one; else None."""
         of, value = self._kept.get(kind, (None, None))
         return value if of == key else None
 
     def remember(self, kind: str, key: object, value: Any) -> None:
-        """Keep what was computed with a key, in the place of the last of that kind. Nobody may write into it."""
+        """Keep a value under `kind` with its key, in place of the last of that kind; it must not be written to."""
         self._kept[kind] = (key, value)
 
 
 def memory_of(recording: Recording) -> Memory | None:
-    """Return the memory of a recording that has one: of one whose samples are kept, or a range of it."""
+    """Return the memory for computed results of a recording that keeps its samples (or range of it); else None."""
     found = getattr(recording, "memory", None)
     return found if isinstance(found, Memory) else None
 
@@ -67,7 +67,7 @@ class CachedRecording:
 
     @property
     def torn(self) -> bool:
-        """Return whether the file ended in the middle of a record and was read up to there."""
+        """Return whether the file ended in the middle of a record; samples up to there are read."""
         return self._whole.torn
 
     @torn.setter
@@ -75,7 +75,7 @@ class CachedRecording:
         self._whole.torn = torn
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
-        """Read the samples in order; see `Recording.blocks`. The blocks' arrays are read-only."""
+        """Yield blocks of `samples` from memory or, the first time, from the file, and then keep them if they fit."""
         if self._kept is not None:
             for start in range(0, len(self._kept.stamp_ns), samples):
                 yield cut(self._kept, start, start + samples)

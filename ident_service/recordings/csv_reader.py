@@ -69,7 +69,7 @@ class CsvColumns:
 
 
 def parse_header(path: Path, header: str, columns: Mapping[str, Column] | None = None) -> CsvColumns:
-    """Find the columns of a recording in its header.
+    """Find the columns of a CSV recording in its first line; raises RecordingError that lists all problems.
 
     Args:
         path: for messages.
@@ -245,7 +245,7 @@ class CsvRecording:
             raise RecordingError(self.path, f"has {self.joints} joints but the arm has {len(joints)}")
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
-        """Read the samples in order, `samples` at a time (the last block is shorter).
+        """Yield the rows in blocks of `samples`, checked; raises RecordingError with the line of the first bad one.
 
         Raises:
             RecordingError: a row with too few or too many fields, a field that is no finite number, a time that

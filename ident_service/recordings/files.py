@@ -18,7 +18,7 @@ _RANGE: Final = re.compile(r"^(?P<path>.+)@(?P<start>\d+(?:\.\d*)?)?:(?P<end>\d+
 
 
 def split_range(path: str) -> tuple[str, tuple[float, float] | None]:
-    """Split `FILE@START:END` into the file and seconds of its recording; files are not looked at.
+    """Split `FILE@START:END` into the path and (start, end) [s], None without a range; no file is looked at.
 
     Raises:
         UsageError: the range ends before it begins.
@@ -36,7 +36,7 @@ def split_range(path: str) -> tuple[str, tuple[float, float] | None]:
 
 
 def require_file(path: Path) -> None:
-    """Raise UsageError unless `path` is a file."""
+    """Raise UsageError unless `path` is an existing file; return nothing."""
     if not path.is_file():
         why = "is a folder, not a recording" if path.is_dir() else "no such file"
         partial = path.with_name(f"{path.name}.partial")
@@ -48,7 +48,7 @@ def require_file(path: Path) -> None:
 
 
 def require_writable(folder: Path) -> None:
-    """Create a folder and check that files can be written into it, before something begins that must be recorded there.
+    """Create a folder and raise UsageError unless a file can be written into it, by writing one for a moment.
 
     Raises:
         UsageError: it cannot be made, or nothing can be written into it.
@@ -65,7 +65,7 @@ def require_writable(folder: Path) -> None:
 
 
 def sha256(path: Path, size: int) -> str:
-    """Return the SHA-256 of the first `size` bytes, so that a file that still grows has a hash of what is read of it.
+    """Return the SHA-256 (hex) of a file's first `size` bytes, so that a growing file can be hashed.
 
     Raises:
         RecordingError: the file cannot be read.
@@ -82,7 +82,7 @@ def sha256(path: Path, size: int) -> str:
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """Write UTF-8 text under its final name only when all of it is on the disk.
+    """Write UTF-8 text to a hidden file, force it to disk, then rename it to `path`; raises UsageError.
 
     Raises:
         UsageError: the folder does not exist or cannot be written.

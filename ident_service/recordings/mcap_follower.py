@@ -73,7 +73,9 @@ class RecordingFollower:
         self.events: list[Event] = []
 
     def read(self, most: int = MOST_BYTES) -> Samples | None:
-        """Return the next samples, from `most` bytes of the file or one record; None where no new record is complete.
+        """Return the next samples that the recorder has flushed, each once; None while there are no new ones.
+
+        At most `most` bytes of the file are read at a time, or one record.
 
         Raises:
             RecordingError: the file is damaged, or no recording of this package.
@@ -105,7 +107,7 @@ class RecordingFollower:
             raise RecordingError(self._path, f"is no recording of ours: {error}") from None
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file that is followed."""
         self._stream.close()
 
     def _records(self, content: bytes) -> list[tuple[int, bytes]]:

@@ -72,7 +72,7 @@ class Layout:
 
     @classmethod
     def parse(cls, payload: bytes) -> Self:
-        """Find the layout of one payload.
+        """Find where the values stand in one JointState payload; raises PayloadError if it is none or inconsistent.
 
         Raises:
             PayloadError: not a JointState in little-endian CDR, or its sequences differ in length.
@@ -122,12 +122,12 @@ class Layout:
         return cls(tuple(names), **starts, fixed=where, expected=np.frombuffer(payload, np.uint8)[where])
 
     def matches(self, rows: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """Return which payloads, one a row, have this layout."""
+        """Return a mask of the payloads, one a row of bytes, that have this layout."""
         same: NDArray[np.bool_] = (rows[:, self.fixed] == self.expected).all(axis=1)
         return same
 
     def columns(self, rows: NDArray[np.uint8], start: int, order: NDArray[np.intp]) -> Matrix:
-        """Return one value sequence of all payloads, shape (payloads, len(order))."""
+        """Return the float64 sequence at byte `start` of all payloads, reordered, shape (payloads, len(order))."""
         values = rows[:, start : start + 8 * len(self.names)]
         return np.ascontiguousarray(values).view("<f8")[:, order].astype(np.float64, copy=False)
 
@@ -148,7 +148,7 @@ class JointStateDecoder:
         self._velocity = velocity
 
     def decode(self, payloads: Sequence[bytes] | NDArray[np.uint8], log_times: Sequence[int] | Stamps) -> Block:
-        """Decode payloads in order.
+        """Decode JointState payloads, in order, into one block; raises PayloadError with the index of a bad one.
 
         Args:
             payloads: JointState messages; of those of one length also as rows, shape (messages, bytes).
@@ -278,7 +278,7 @@ class Extras:
 def read_extras(
     path: Path, stream: IO[bytes], size: int, utc_offset_ns: int, runs: Iterable[bytes] | None = None
 ) -> Extras:
-    """Read the extras from an open file, up to the damage where there is some.
+    """Return metadata, attachments, events and the arm's description from an open file, up to any damage.
 
     Args:
         path: for messages.
@@ -331,7 +331,7 @@ def read_extras(
 
 
 def event(payload: bytes, utc_offset_ns: int) -> Event:
-    """Decode a message of `/events`, its stamp less `utc_offset_ns` [ns]; struct.error where it is malformed."""
+    """Decode a message of `/events`, its stamp less `utc_offset_ns` [ns]; raises struct.error if malformed."""
     seconds, nanoseconds, level = struct.unpack_from("<iIB", payload, 4)
     name, position = _string(payload, _LOG_TEXTS)
     message, _ = _string(payload, position)
@@ -371,7 +371,7 @@ class Cycles:
 
 
 def read_cycles(path: Path) -> Iterator[Cycles]:
-    """Read `/cycle` in order, some thousand cycles at a time, up to where the file is cut off or damaged.
+    """Yield the records of `/cycle` in order, thousands at a time, up to where the file is cut off or damaged.
 
     Yields nothing from a file that is not MCAP or has no such topic of this package's type.
 
@@ -522,7 +522,7 @@ class McapRecording:
         )
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
-        """Read the samples in order, `samples` at a time (the last block is shorter).
+        """Yield the samples in blocks of `samples` (the last is shorter); raises RecordingError for bad values.
 
         Velocity is there when the first message has one; a first velocity of nothing but NaN counts as none.
 
@@ -534,7 +534,7 @@ class McapRecording:
         return assemble(pieces, samples, self.path, self.joint_names, skip_missing=self._skip_missing)
 
     def read_extras(self) -> Extras:
-        """Read what stands beside the samples: metadata, attachments, events, the arm's description.
+        """Return what stands beside the samples: metadata, attachments, events, the arm's description.
 
         Raises:
             RecordingError: attachments of more than 64 MiB.
@@ -543,7 +543,7 @@ class McapRecording:
             return read_extras(self.path, stream, self._size, self._offset_ns, self._runs)
 
     def read_cycles(self) -> Iterator[Cycles]:
-        """Read `/cycle` as the function of that name does, from what has been expanded already.
+        """Yield the records of `/cycle` in order, as `mcap_reader.read_cycles`; from memory where expanded already.
 
         Raises:
             RecordingError: likewise.
@@ -551,7 +551,7 @@ class McapRecording:
         yield from read_cycles(self.path) if self._runs is None else _decoded(self.path, _payloads(self._runs))
 
     def measured(self, topic: str) -> tuple[Stamps, Matrix]:
-        """Read the torques that drives measured.
+        """Return stamps [ns] and torques [N m or N] of a topic's measured torques, NaN where missing; may be empty.
 
         Args:
             topic: topic with sensor_msgs/msg/JointState that have effort only.

@@ -74,14 +74,14 @@ class Period(NamedTuple):
 
     @classmethod
     def of(cls, run: bytes, begins: Sequence[int], end: int, wanted: Sequence[int]) -> Period:
-        """Return the period of the messages at `begins`, which end at `end`."""
+        """Build the repeating pattern of messages at the offsets `begins` in a run of bytes, up to `end`."""
         start, length = begins[0], end - begins[0]
         where = np.add.outer(np.array(begins) - start, np.arange(_MESSAGE_HEAD.size)).ravel()
         expected = np.frombuffer(run, np.uint8, length, start)[where]
         return cls(length, where, expected, tuple(at - start for at in wanted))
 
     def repeats(self, run: bytes, position: int) -> int:
-        """Return how often it follows from `position` on, in kind, length and channel."""
+        """Return how often in a row the pattern stands in `run` from `position` on."""
         length = self.length
         rows = np.frombuffer(run, np.uint8, (len(run) - position) // length * length, position).reshape(-1, length)
         same = (rows[:, self.where] == self.expected).all(axis=1)
@@ -103,15 +103,12 @@ class Directory:
 
 
 def records(stream: IO[bytes], size: int, wanted: Collection[int]) -> Iterator[tuple[int, bytes]]:
-    """Walk the file's records in order and read those wanted.
+    """Yield (opcode, content) of the wanted records of a file in order; raises TornError at the first damage.
 
     Args:
         stream: the file, from its first byte on.
         size: how many of its bytes to read at most.
         wanted: opcodes to read; the others are stepped over.
-
-    Yields:
-        Opcode and content of each wanted record.
 
     Raises:
         TornError: the bytes end before the closing magic, or cannot be records.
@@ -144,7 +141,7 @@ def records(stream: IO[bytes], size: int, wanted: Collection[int]) -> Iterator[t
 
 
 def contents(stream: IO[bytes], size: int) -> Iterator[bytes]:
-    """Yield every chunk, expanded and checked, as one run of records; a record outside of chunks is a run of its own.
+    """Yield each chunk of a file, expanded and checked, as bytes of records; records outside chunks singly.
 
     Raises:
         TornError: as `records`, or a chunk that is damaged.
@@ -155,12 +152,12 @@ def contents(stream: IO[bytes], size: int) -> Iterator[bytes]:
 
 
 def run_of(opcode: int, content: bytes) -> bytes:
-    """Return the run of records in a record of `CONTENTS`: those of a chunk, else the record itself."""
+    """Return the bytes of the records in a chunk, expanded; of any other record, that record itself."""
     return expand(content) if opcode == Opcode.CHUNK else _HEAD.pack(opcode, len(content)) + content
 
 
 def expand(content: bytes) -> bytes:
-    """Decompress a chunk record's content, checked against its size and, where it has one, its CRC."""
+    """Return the decompressed records of a chunk; raises TornError where its size or CRC is wrong."""
     import lz4.frame  # type: ignore[import-untyped]
     import zstandard
     from mcap.records import Chunk
@@ -189,11 +186,7 @@ def expand(content: bytes) -> bytes:
 
 
 def messages(run: bytes, directory: Directory, choose: Callable[[int], bool] = lambda _: True) -> Iterator[Message]:
-    """Yield the messages in a run of records one by one, as `series` finds them.
-
-    Yields:
-        Channel id, log time [ns], payload.
-    """
+    """Yield channel id, log time [ns] and payload of each message in bytes of records, one by one."""
     for found in series(run, directory, choose):
         if isinstance(found, Series):
             for stamp, row in zip(found.log_times.tolist(), found.payloads, strict=True):
@@ -205,7 +198,7 @@ def messages(run: bytes, directory: Directory, choose: Callable[[int], bool] = l
 def series(
     run: bytes, directory: Directory, choose: Callable[[int], bool] = lambda _: True
 ) -> Iterator[Message | Series]:
-    """Yield the messages in a run of records; channels and schemas go into `directory`.
+    """Yield the messages in bytes of records; enter channels and schemas into `directory`.
 
     Where records repeat in kind, length and channel, as those of a loop do, all of them are found at once.
 
@@ -290,7 +283,7 @@ def _gathered(run: bytes, offset: int, position: int, period: int, count: int) -
 
 
 def metadata(content: bytes) -> Metadata:
-    """Parse a metadata record's content."""
+    """Parse a metadata record's content into an mcap `Metadata`."""
     from mcap.records import Metadata
 
     parsed: Metadata = _parse(Metadata, content)
@@ -298,7 +291,7 @@ def metadata(content: bytes) -> Metadata:
 
 
 def attachment(content: bytes) -> Attachment:
-    """Parse an attachment record's content."""
+    """Parse an attachment record's content into an mcap `Attachment`."""
     from mcap.records import Attachment
 
     parsed: Attachment = _parse(Attachment, content)

@@ -139,7 +139,7 @@ class CdrBuilder:
         self._data = bytearray()
 
     def align(self, size: int) -> None:
-        """Fill up to the next multiple of `size` [bytes]."""
+        """Append zeros up to the next multiple of `size` [bytes]."""
         self._data.extend(bytes(-len(self._data) % size))
 
     def uint8(self, value: int) -> None:
@@ -147,17 +147,17 @@ class CdrBuilder:
         self._data.append(value)
 
     def uint32(self, value: int) -> None:
-        """Append four bytes at a multiple of four."""
+        """Append four bytes, little-endian, at the next multiple of four."""
         self.align(4)
         self._data += struct.pack("<I", value)
 
     def stamp(self, utc_ns: int) -> None:
-        """Append a builtin_interfaces/Time from nanoseconds since 1970."""
+        """Append a builtin_interfaces/Time, aligned to four bytes, from nanoseconds since 1970."""
         self.align(4)
         self._data += stamp_bytes(utc_ns)
 
     def string(self, value: str) -> None:
-        """Append a string: length with the closing zero, the bytes in UTF-8, and the zero."""
+        """Append a CDR string: aligned length with the closing zero, the bytes in UTF-8, and the zero."""
         encoded = value.encode()
         self.uint32(len(encoded) + 1)
         self._data += encoded + b"\x00"
@@ -167,24 +167,24 @@ class CdrBuilder:
         return bytes(self._data)
 
     def payload(self) -> bytes:
-        """Return the whole message."""
+        """Return the whole message: encapsulation header, then the bytes appended so far."""
         return ENCAPSULATION + self._data
 
 
 def stamp_bytes(utc_ns: int) -> bytes:
-    """Encode a builtin_interfaces/Time: whole seconds rounded down, and the nanoseconds on top."""
+    """Return the eight bytes of a builtin_interfaces/Time: seconds rounded down, and nanoseconds."""
     return _STAMP.pack(*divmod(utc_ns, 1_000_000_000))
 
 
 def encode_string(data: str) -> bytes:
-    """Encode a std_msgs/msg/String."""
+    """Return the payload of a std_msgs/msg/String."""
     builder = CdrBuilder()
     builder.string(data)
     return builder.payload()
 
 
 def encode_log(utc_ns: int, level: int, name: str, message: str) -> bytes:
-    """Encode a rcl_interfaces/msg/Log without a source position; `level` is 10 (debug), 20, 30, 40 or 50 (fatal)."""
+    """Return the payload of a rcl_interfaces/msg/Log; `level` is 10 (debug), 20, 30, 40 or 50 (fatal)."""
     builder = CdrBuilder()
     builder.stamp(utc_ns)
     builder.uint8(level)
@@ -220,7 +220,7 @@ class JointStateEncoder:
         self._count_aligned = struct.pack("<I4x", self._joints)
 
     def encode_effort(self, utc_ns: int, effort: ArrayLike) -> bytes:
-        """Encode one message without position and velocity.
+        """Return the payload of a JointState that has only effort, no position or velocity.
 
         Args:
             utc_ns: stamp [ns since 1970].
@@ -232,7 +232,7 @@ class JointStateEncoder:
         return b"".join((ENCAPSULATION, stamp_bytes(utc_ns), self._until_effort, self._floats(effort)))
 
     def encode(self, utc_ns: int, position: ArrayLike, velocity: ArrayLike | None, effort: ArrayLike | None) -> bytes:
-        """Encode one message.
+        """Return the payload of a JointState; velocity or effort of None become empty sequences.
 
         Args:
             utc_ns: stamp [ns since 1970].
@@ -278,7 +278,7 @@ class CycleEncoder:
         age: ArrayLike,
         lost: int,
     ) -> bytes:
-        """Encode one message.
+        """Return the payload of one `/cycle` message: lateness, computing time, validity and age per axis.
 
         Args:
             utc_ns: stamp [ns since 1970].
@@ -350,7 +350,7 @@ class _VelocityEstimate:
 
 
 def root_link(urdf: str) -> str:
-    """Return the link of a URDF that no joint carries, empty where the text has none."""
+    """Return the name of a URDF's link that no joint carries; empty where the text is no XML or has none."""
     try:
         robot = ET.fromstring(urdf)  # noqa: S314 - written by this package, or by the caller for its own file
     except ET.ParseError:
@@ -467,7 +467,7 @@ class RecordingWriter:
             error.add_note(f"the recording could not be finished either: {second}")
 
     def sample(self, cycle: Cycle) -> None:
-        """Write one cycle to `/joint_states`, `/joint_commands`, `/cycle`, and what drives measure beside.
+        """Write one cycle: `/joint_states`, `/joint_commands`, `/cycle`, and measured torque and encoders if given.
 
         Raises:
             RecordingNotWritten: the file cannot be written.
@@ -492,12 +492,12 @@ class RecordingWriter:
         self._add(cycle.stamp_ns, messages, sequence=cycle.cycle)
 
     def event(self, stamp_ns: int, level: int, message: str) -> None:
-        """Write one line to `/events`; `level` is 10 (debug), 20 (info), 30 (warning), 40 (error) or 50 (fatal)."""
+        """Write a line to `/events`; `level` is 10 (debug), 20 (info), 30 (warning), 40 (error) or 50 (fatal)."""
         log = encode_log(stamp_ns + self._utc_offset_ns, level, METADATA_NAME, message)
         self._add(stamp_ns, (("/events", log),))
 
     def finish(self, *, complete: bool = True) -> None:
-        """Write the end of the file, force it to the disk and rename it; does nothing the second time.
+        """Write the file's end, force it to disk, rename `<path>.partial` to `path`; does nothing the second time.
 
         Raises:
             RecordingError: one of these failed; what was written stays in `<path>.partial`.

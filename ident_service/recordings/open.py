@@ -27,7 +27,7 @@ def open_recording(
     transmission: Transmission | None = None,
     torque: Literal["measured", "commanded"] | None = "commanded",
 ) -> Recording:
-    """Open an MCAP or CSV recording for reading; its blocks are on the joint side.
+    """Open an MCAP or CSV recording, told by its content; samples are decoded later, on the joint side.
 
     A recording that this package wrote names its joints as the arm does and is on the joint side already: of `fmt`,
     topic, names and side are for the files of others.
@@ -41,7 +41,7 @@ def open_recording(
             sample has it, else the commanded one. Files of others have one torque.
 
     Returns:
-        The recording; its file is read when its blocks are.
+        The recording; its samples are decoded when its blocks are read.
 
     Raises:
         UsageError: no such file; motor side, but no transmission.

@@ -133,7 +133,7 @@ class Quality:
     skipped: int = 0
 
     def warnings(self) -> tuple[str, ...]:
-        """Return warnings about the recording for a person, in words; empty for a good recording."""
+        """Return sentences that warn of a recording's tears, gaps, jitter and the like; empty for a good one."""
         found = []
         if self.torn:
             found.append(f"the file is torn; it was read up to {self.duration_s:.4g} s after its first sample")
@@ -171,7 +171,7 @@ class Quality:
 
 
 def quality(recording: Recording, fmt: RecordingFormat, torque_limit: Array | None = None) -> Quality:
-    """Assess a recording, in constant memory.
+    """Assess a recording's rate, jitter, gaps, saturation and standstill in one more pass of constant memory.
 
     Args:
         recording: recording, which is read once more after `grid`.

@@ -131,7 +131,7 @@ class RecorderProcess:
 
     @property
     def ends(self) -> SinkEnds:
-        """Return the file descriptors that another process needs for a `RingSink`.
+        """Return the file descriptors for a `RingSink` in another process; raises RecordingError unless recording.
 
         Raises:
             RecordingError: not entered, or closed.
@@ -142,19 +142,19 @@ class RecorderProcess:
 
     @property
     def written(self) -> int:
-        """Return how many records the writer has put into the ring, whichever process that is; 0 once it is closed."""
+        """Return how many records the writer has put into the ring, in any process; 0 once the ring is closed."""
         if self._ends is None:
             return 0
         return int.from_bytes(os.pread(self._ends.ring, 8, 8 * WRITTEN), sys.byteorder)
 
     @property
     def overruns(self) -> int:
-        """Return how often `put` or `event` returned False."""
+        """Return how often `put` or `event` found the recorder too far behind, or gone, and returned False."""
         return self._overruns if self._sink is None else self._sink.overruns
 
     @property
     def error(self) -> str:
-        """Return why the recording failed, empty as long as it has not."""
+        """Return why the recording failed; empty as long as it has not."""
         return self._error if self._sink is None else self._sink.error
 
     @property
@@ -163,15 +163,15 @@ class RecorderProcess:
         return 0 if self._process is None else self._process.pid
 
     def put(self, cycle: Cycle) -> bool:
-        """Record one cycle; see `RingSink.put`."""
+        """Put one cycle into the ring for the recorder; return whether the recorder keeps up."""
         return self._open_sink().put(cycle)
 
     def event(self, stamp_ns: int, level: int, message: str) -> bool:
-        """Record one event; see `RingSink.event`."""
+        """Put one event into the ring for the recorder; return whether the recorder keeps up."""
         return self._open_sink().event(stamp_ns, level, message)
 
     def close(self, *, complete: bool = True) -> None:
-        """Wait until all that was put is written and the process has ended; a second time only repeats its error.
+        """Wait until all that was put is on disk and the recorder has ended; raises RecordingNotWritten if it is not.
 
         Raises:
             RecordingNotWritten: a sample could not be written, records were lost, the file cannot be finished, or the

@@ -67,7 +67,7 @@ class RecorderReport:
 
 
 def message_of(error: Exception) -> str:
-    """Return an error in one sentence, without the path that a RecordingError begins with."""
+    """Return an error as one sentence, without the path that a RecordingError begins with."""
     if isinstance(error, RecordingError):
         return str(error).removeprefix(f"{error.path}: ")
     return str(error) if isinstance(error, IdentError) else f"recording failed: {error or type(error).__name__}"
@@ -99,7 +99,7 @@ class RingConsumer:
         self._poll.register(work, select.POLLIN)
 
     def run(self) -> RecorderReport:
-        """Record until the end; whatever goes wrong is in the report, and in the ring before the file is finished."""
+        """Write all records of the ring to the file until the end; return a report, with the error if one occurred."""
         error, complete = "", False
         try:
             complete = self._consume() and not self._reader.lost
@@ -186,7 +186,7 @@ class RingConsumer:
 
 
 def serve(channel: socket.socket, ring: int, work: int, room: int) -> None:
-    """Record what the request on the channel asks for; errors go to the parent."""
+    """Record into the file that the request on `channel` names, until the end; answer there with report or error."""
     with channel.makefile("rb") as lines:
 
         def tell(answer: Mapping[str, object]) -> None:
@@ -223,7 +223,7 @@ def serve(channel: socket.socket, ring: int, work: int, room: int) -> None:
 
 
 def main() -> None:
-    """Run the recorder process, started with its four file descriptors as arguments."""
+    """Run the recorder process: four descriptors (ring, channel, work, room) are its arguments."""
     for number in IGNORED:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, IGNORED)  # the parent blocked them until here

@@ -50,7 +50,7 @@ class Block:
 
 
 def join(blocks: Sequence[Block]) -> Block:
-    """Join consecutive blocks, at least one, into one."""
+    """Return consecutive blocks, at least one, as one block."""
     if len(blocks) == 1:
         return blocks[0]
     velocities = [block.velocity for block in blocks if block.velocity is not None]
@@ -69,7 +69,7 @@ def join(blocks: Sequence[Block]) -> Block:
 
 
 def cut(block: Block, start: int, stop: int) -> Block:
-    """Return samples `start` to `stop` of a block, as views; its repeats count in the part with its first sample."""
+    """Return samples `start` to `stop` of a block, as views; `repeats` goes with the part that begins at 0."""
     part = slice(start, stop)
     velocity = None if block.velocity is None else block.velocity[part]
     repeats = block.repeats if start == 0 else 0
@@ -99,7 +99,7 @@ class Recording(Protocol):
     torn: bool
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
-        """Read the samples in order, `samples` at a time (the last block is shorter).
+        """Yield the samples in order, in blocks of `samples` (the last is shorter); raises RecordingError.
 
         Raises:
             RecordingError: NaN or infinite values, stamps that run backwards or repeat with other values, a torn row
@@ -116,7 +116,7 @@ def assemble(
     *,
     skip_missing: bool = False,
 ) -> Iterator[Block]:
-    """Cut consecutive pieces anew and check each block; the blocks' arrays are read-only.
+    """Regroup pieces into blocks of `samples`, each checked (finite values, increasing stamps) and read-only.
 
     Args:
         pieces: consecutive samples in pieces of any length, all with or all without velocity.

@@ -107,12 +107,12 @@ class Grid:
 
     @property
     def gaps(self) -> tuple[Segment, ...]:
-        """Return each gap, from the last sample before it to the first one after it."""
+        """Return each gap as a segment from the last sample before it to the first one after it."""
         pairs = zip(self.segments[:-1], self.segments[1:], strict=True)
         return tuple(Segment(before.last_ns, after.first_ns) for before, after in pairs)
 
     def least_s(self, shortest_s: float) -> float:
-        """Return the least duration of a usable segment [s]: as asked for, and enough for a curve through four samples.
+        """Return the least duration of a usable segment [s]: `shortest_s`, or more where resampling needs it.
 
         Args:
             shortest_s: shortest duration asked for [s].
@@ -122,7 +122,7 @@ class Grid:
 
 
 def grid(recording: Recording, fmt: RecordingFormat) -> Grid:
-    """Read a recording's stamps once and determine their period, jitter and gaps.
+    """Return period, jitter and gaps of a recording's stamps, read once and kept where it has a memory.
 
     Raises:
         RecordingError: fewer than two samples, or none left after trimming; more than 1000 gaps; a rate asked for
@@ -207,7 +207,7 @@ def _grid(recording: Recording, fmt: RecordingFormat) -> Grid:
 
 
 def trimmed(blocks: Iterable[Block], trim: tuple[float, float]) -> Iterator[Block]:
-    """Yield blocks without the first and the last seconds; holds back as many samples as the last seconds have.
+    """Yield blocks without the first and the last seconds of `trim`, cutting those at the borders.
 
     Args:
         blocks: blocks of a recording, in order.
@@ -329,7 +329,7 @@ def uniform(
     shortest_s: float = 0.0,
     samples: int = BLOCK_SAMPLES,
 ) -> Iterator[UniformRun]:
-    """Read a recording as uniform samples, segment after segment, in constant memory.
+    """Yield a recording as uniformly spaced samples, segment by segment; unchanged where regular already.
 
     A regular recording passes through bit for bit, cut at its gaps; so do the values of one whose stamps are of
     arrival, which get even stamps from each segment's first one on. Any other is resampled at `first + k period` in all
@@ -509,7 +509,7 @@ class ArrivalTest:
         self._even = self._in_proportion = 0.0
 
     def add(self, block: Block) -> None:
-        """Add the next samples."""
+        """Add the next samples to the test's sums."""
         run = block if self._tail is None else join([self._tail, block])
         self._tail = cut(run, max(0, len(run.stamp_ns) - 3), len(run.stamp_ns))
         if len(run.stamp_ns) < 4:
@@ -527,7 +527,10 @@ class ArrivalTest:
         self._in_proportion += float((in_proportion**2).sum())
 
     def arrival(self) -> bool | None:
-        """Return True for stamps of arrival, False for stamps of sampling, None where it cannot be told."""
+        """Return True if stamps are of arrival, False if of sampling, None where the motion cannot tell.
+
+        Told by whether irregular steps of time go with even steps of position, or with steps in proportion.
+        """
         if self._steps < _LEAST:
             return None
         if _CLEAR * self._even < self._in_proportion:

@@ -131,7 +131,7 @@ class State(enum.IntEnum):
 
 
 def create_memory(joints: int, slots: int, slot_bytes: int) -> int:
-    """Create the memory of a ring, all of it allocated, and nothing written yet.
+    """Create a ring's shared memory, allocated and empty; return its file descriptor, for the caller to close.
 
     Args:
         joints: number of joints in every record, 1 to 64.
@@ -208,11 +208,11 @@ class RingMemory:
         self.words = self._bytes.cast("Q")
 
     def slot_word_index(self, number: int) -> int:
-        """Return the index of the word that record `number`'s slot begins with."""
+        """Return the index of the 8-byte word that the slot of record `number` begins with."""
         return (HEADER_BYTES + number % self.slots * self.slot_bytes) >> 3
 
     def set_text(self, text: str) -> None:
-        """Store the reason of a failure; the state that announces it is stored afterwards."""
+        """Store the reason of a failure in the ring, cut to fit; the state that announces it is set later."""
         data = text.encode("utf-8", "backslashreplace")[:_TEXT_MOST]
         self.content[_TEXT : _TEXT + len(data)] = data
         self.words[_TEXT_BYTES] = len(data)
@@ -260,17 +260,17 @@ Record = Cycle | EventRecord
 
 
 def cycle_bytes(joints: int) -> int:
-    """Return the size of a cycle's content behind the checksum [bytes]."""
+    """Return the size of a cycle's content in a slot, behind the checksum [bytes]."""
     return AT_VECTORS - BODY + 8 * (VECTORS + 1) * joints + joints
 
 
 def slot_bytes(joints: int) -> int:
-    """Return the size of a slot [bytes], in whole cache lines, so that two slots never share one."""
+    """Return the size of a slot [bytes] for so many joints, a multiple of 64 (cache lines)."""
     return max(_LEAST_BYTES, -(-(8 + BODY + cycle_bytes(joints)) // 64) * 64)
 
 
 def message_bytes(message: str, room: int) -> bytes:
-    """Encode a message in UTF-8, cut at a whole character and marked as cut where it does not fit `room` [bytes]."""
+    """Return a message in UTF-8, cut at a whole character and ending in `[cut]` where longer than `room` [bytes]."""
     data = message.encode("utf-8", "backslashreplace")
     if len(data) <= room:
         return data
@@ -278,7 +278,7 @@ def message_bytes(message: str, room: int) -> bytes:
 
 
 def decode(content: bytes, number: int, joints: int) -> Record | None:
-    """Decode a slot's content, None unless it is record `number`, whole."""
+    """Return the cycle or event in a slot's content; None unless it is record `number` and its checksum fits."""
     checksum, length = CHECK.unpack_from(content)
     if not HEAD.size <= length <= len(content) - BODY or zlib.crc32(content[BODY : BODY + length]) != checksum:
         return None
@@ -308,7 +308,7 @@ _RETRIES: Final = 16
 
 
 def create_ring(joints: int, slots: int = SLOTS) -> int:
-    """Create an empty ring; see `create_memory` for the file descriptor that it returns and the errors it raises."""
+    """Create an empty ring; return its file descriptor, for the caller to close."""
     return create_memory(joints, slots, slot_bytes(joints))
 
 
@@ -353,7 +353,7 @@ class RingWriter:
         self._cycle = whole[: BODY + self._cycle_bytes]
 
     def put(self, cycle: Cycle) -> None:
-        """Write one cycle; its arrays are copied.
+        """Copy one cycle into the ring, over the oldest record if it is full; never waits.
 
         Raises:
             ValueError: an array of another shape or type.
@@ -384,7 +384,7 @@ class RingWriter:
         self._publish(self._cycle)
 
     def event(self, stamp_ns: int, level: int, message: str) -> None:
-        """Write one event; a message that does not fit the slot is cut and ends in `[cut]`.
+        """Write one event into the ring; a message that does not fit the slot is cut and ends in `[cut]`.
 
         Raises:
             struct.error: an integer beyond its bits.
@@ -394,7 +394,7 @@ class RingWriter:
         self._publish(CHECK.pack(zlib.crc32(body), len(body)) + body)
 
     def close(self, *, finished: bool) -> bool:
-        """Tell the readers that this was the last record; the records stay readable.
+        """Mark the ring as closed, so that readers know the last record; return False if it was closed already.
 
         Args:
             finished: False when the motion ended early, in an exception for example.
@@ -465,7 +465,7 @@ class RingReader:
 
     @property
     def closed(self) -> Closed:
-        """Return whether the writer has written its last record; load this before the `read` that is to be the last."""
+        """Return whether the ring is open, finished or ended early; load it before the `read` that is to be last."""
         return Closed(self._words[CLOSED])
 
     @property
@@ -475,11 +475,11 @@ class RingReader:
 
     @property
     def writer_heartbeat_ns(self) -> int:
-        """Return the monotonic time of the writer's last record [ns]."""
+        """Return the monotonic time of the writer's last sign of life [ns]."""
         return self._words[WRITER_HEARTBEAT]
 
     def read(self) -> Record | None:
-        """Return the next record that still exists, None while there is none; never waits."""
+        """Return the next record that is not overwritten yet; None while there is none. Never waits."""
         words, torn = self._words, 0
         while True:
             number = self.cursor
@@ -511,15 +511,15 @@ class RingReader:
                         torn = 0
 
     def taken(self) -> None:
-        """Tell the motion loop, as the recorder, that everything before the cursor has been processed."""
+        """Publish the recorder's cursor: every record before it has been processed."""
         self._words[CURSOR] = self.cursor
 
     def beat(self) -> None:
-        """Renew the recorder's heartbeat."""
+        """Store the current monotonic time as the recorder's heartbeat."""
         self._words[RECORDER_HEARTBEAT] = time.monotonic_ns()
 
     def end(self, error: str | None = None) -> None:
-        """Announce, as the recorder, that no record will be taken any more, and why if something failed."""
+        """Mark, as the recorder, that no more records are taken: ended, or failed with `error` as the reason."""
         if error is not None:
             self.memory.set_text(error)
         self._words[STATE] = State.ENDED if error is None else State.FAILED

@@ -52,7 +52,7 @@ class SinkEnds:
     room: int
 
     def close(self) -> None:
-        """Close all descriptors."""
+        """Close all descriptors in this process."""
         for fd in astuple(self):
             os.close(fd)
 
@@ -104,15 +104,15 @@ class RingSink:
 
     @property
     def error(self) -> str:
-        """Return why the recorder takes nothing any more, in its own words where it left some; else empty."""
+        """Return why the recorder takes no more records, in its own words where it left some; empty while it does."""
         if self._words[at.STATE] == State.FAILED:
             return self.writer.memory.text()
         return self._gone
 
     def put(self, cycle: Cycle) -> bool:
-        """Record one cycle; its arrays are copied.
+        """Put one cycle into the ring; return whether the recorder keeps up, or in lock step wait until it does.
 
-        In lock step this may wait for the recorder; otherwise it never does.
+        The cycle's arrays are copied. Out of lock step this never waits.
 
         Returns:
             Whether the recording keeps up; in lock step always True.
@@ -127,7 +127,7 @@ class RingSink:
         return self._wait() if self._lock_step else self._keeps_up()
 
     def event(self, stamp_ns: int, level: int, message: str) -> bool:
-        """Record one event behind the samples put so far; result and errors as for `put`."""
+        """Put one event behind the samples put so far; return whether the recorder keeps up, as `put` does."""
         try:
             self.writer.event(stamp_ns, level, message)
         except struct.error as error:
@@ -135,12 +135,12 @@ class RingSink:
         return self._wait() if self._lock_step else self._keeps_up()
 
     def close(self, *, complete: bool = True) -> None:
-        """Announce the last record to the recorder; does not wait for it, and does nothing the second time."""
+        """Mark the ring as closed and wake the recorder; does not wait for it, and does nothing the second time."""
         if self.writer.close(finished=complete):
             os.eventfd_write(self._ends.work, 1)
 
     def release(self) -> None:
-        """Release the ring's memory; nothing can be put or asked any more."""
+        """Unmap the ring's memory; nothing can be put or asked any more."""
         self.writer.memory.close()
 
     def _keeps_up(self) -> bool:

@@ -23,7 +23,7 @@ from ident_service.certificate_verifier import verify_path
 from ident_service.cli import main
 from ident_service.errors import Unavailable
 from ident_service.fleet.identify import identify_fleet
-from ident_service.fleet.reduction import FleetRequest, in_order, result_of
+from ident_service.fleet.reduction import FleetRequest, result_of, results_as_completed
 
 # These load for two seconds where they are used, and not where tests are only collected.
 if TYPE_CHECKING:
@@ -293,7 +293,7 @@ def test_a_task_that_ends_its_worker_is_given_up(cluster: LocalCluster) -> None:
         client.wait_for_workers(2)
         client.run_on_scheduler(_allow, 0)
         try:
-            assert dict(in_order(client, _ends, [(0,), (1,)], lambda number: -number)) == {0: 0, 1: -1}
+            assert dict(results_as_completed(client, _ends, [(0,), (1,)], lambda number: -number)) == {0: 0, 1: -1}
             with pytest.raises(Unavailable, match="choosing ended every worker that tried; give workers more"):
                 result_of(client.submit(_ends, 1, pure=False), "choosing")
         finally:

@@ -60,7 +60,7 @@ class ChangeEllipsoid:
     moves: NDArray[np.bool_]
 
     def moved(self, beta: Array) -> Array:
-        """Return N x of other base parameters, shape (rows,); they are near where its length is below 1."""
+        """Return N (beta - origin), shape (rows,); its norm is below 1 inside the ellipsoid."""
         return np.asarray(self.metric @ (beta - self.origin))
 
 
@@ -86,7 +86,7 @@ def centre(
     likely: LikelyBodies | None = None,
     near: ChangeEllipsoid | None = None,
 ) -> Array:
-    """Move link parameters to the centre of those with the same base parameters.
+    """Return link parameters moved to the centre of those with the same (or `near`) base parameters.
 
     Args:
         delta: inside the feasible set (margin above 0), SI units, shape (parameters,).

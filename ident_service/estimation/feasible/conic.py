@@ -72,18 +72,18 @@ class ScaledProblem:
     scale: float
 
     def point(self, y: Array) -> Array:
-        """Return the variables in the problem's original coordinates."""
+        """Return the variables x in the problem's original coordinates, from the scaled ones y."""
         return np.asarray(self.origin + _apply(self.columns, y))
 
     def duals(self, found: Sequence[Array]) -> list[Array]:
-        """Return the multipliers in the problem's original coordinates."""
+        """Return the multipliers in the problem's original coordinates, from those of the scaled problem."""
         return [self.scale * _transposed(M, z) for M, z in zip(self.maps, found, strict=True)]
 
 
 def precondition(
     rows: Sequence[Rows], objective: Array, hessian: Array, around: Array, columns: Columns | None
 ) -> ScaledProblem:
-    """Return the problem preconditioned around a point, or unchanged.
+    """Return the conic problem rescaled around a point for better conditioning; unchanged where `columns` is None.
 
     Args:
         rows: constraints.
@@ -259,7 +259,7 @@ class ConicProblem:
     def minimise(
         self, objective: Array, name: str, quadratic: Array | None = None, enough: float | None = None
     ) -> Solution:
-        """Minimise an objective over the constraints.
+        """Return the x that minimises an objective over the constraints added so far; raises SolverError.
 
         Args:
             objective: linear coefficients, shape (variables,).
@@ -325,7 +325,7 @@ class CompressedColumns:
 
     @staticmethod
     def of(matrix: Array) -> CompressedColumns:
-        """Return the nonzero entries of a matrix."""
+        """Build the compressed sparse columns of a matrix."""
         columns, rows = np.nonzero(matrix.T)
         ends = np.searchsorted(columns, np.arange(matrix.shape[1] + 1))
         return CompressedColumns(matrix[rows, columns], rows, ends, (matrix.shape[0], matrix.shape[1]))

@@ -74,7 +74,7 @@ class ConvexEstimate:
 
 
 def available_solvers() -> tuple[str, ...]:
-    """List the installed solvers that solve semidefinite problems, lower case."""
+    """List the installed cvxpy solvers that solve semidefinite problems, in lower case."""
     import cvxpy as cp
     from cvxpy.reductions.solvers.defines import SOLVER_MAP_CONIC
 
@@ -87,7 +87,7 @@ def available_solvers() -> tuple[str, ...]:
 
 
 def require_solver(solver: str) -> str:
-    """Return the name that cvxpy knows a solver by.
+    """Return the name (upper case) that cvxpy knows a solver by; raises UsageError if it is not installed.
 
     Raises:
         UsageError: it is not installed, or solves no semidefinite problems.
@@ -168,7 +168,7 @@ def convex_least_squares(
 
 
 def objective(fit: LeastSquares, found: FeasibleEstimate, prior: Prior | None) -> float:
-    """Return what an estimate minimises: |R_1 beta - rho_1|, or the sum of squares with what is added to it.
+    """Return the objective's value at an estimate: |R_1 beta - rho_1|, or the weighted sum with prior and penalty.
 
     Args:
         fit: the unconstrained least squares.
@@ -346,12 +346,12 @@ class SecondOpinion:
 
     @property
     def agrees(self) -> bool:
-        """Return whether the two solutions predict the same torques, to a thousandth."""
+        """Return whether the two solutions' predicted torques differ by less than 0.1 % of the torques."""
         return self.torque_percent < AGREED_BELOW
 
     @property
     def conclusive(self) -> bool:
-        """Return whether the second solver reached its optimum; one that stopped early disproves nothing."""
+        """Return whether the comparison counts: the solutions agree, or the second is optimal and inside the set."""
         return self.agrees or (self.status == "optimal" and self.margin > 0.0)
 
 
@@ -366,7 +366,7 @@ def second_opinion(
     custom: CustomFunction | None = None,
     solver: str | None = None,
 ) -> SecondOpinion:
-    """Solve again what `first` solves, within the same bound of masses.
+    """Solve the problem of `first` again with another solver; return how far the two solutions are apart.
 
     Args:
         first: the estimate; with `custom` it was found through cvxpy, by `solver`.

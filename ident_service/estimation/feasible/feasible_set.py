@@ -59,7 +59,7 @@ REFERENCE_FRICTION = 0.1  # N m, N m s/rad and what else friction is measured in
 
 
 def reference(name: str) -> float:
-    """Return the reference scale of a link parameter, by its name."""
+    """Return the order of magnitude [SI] that a link parameter is scaled by, chosen by its name's symbol."""
     symbol = name.rstrip("0123456789")
     if symbol == "m":
         return REFERENCE_MASS
@@ -69,7 +69,7 @@ def reference(name: str) -> float:
 
 
 def link_of(name: str) -> str:
-    """Return the number of the link that a parameter belongs to, which its name ends in."""
+    """Return the digits that a parameter's name ends in: the number of its link, as text."""
     return name[len(name.rstrip("0123456789")) :]
 
 
@@ -92,15 +92,15 @@ class Block:
     scale: tuple[float, ...] = ()
 
     def smallest(self, delta: Array) -> float:
-        """Return the smallest eigenvalue, or smallest number, of the block at `delta`."""
+        """Return the smallest eigenvalue of the block's matrix at `delta`, or its smallest number."""
         return self._smallest(delta, np.ones(self.size or len(self.f)))
 
     def smallest_scaled(self, delta: Array) -> float:
-        """Return the largest t with the block at `delta` minus t times its reference scale positive semidefinite."""
+        """Return the largest t with block(delta) - t S positive semidefinite, S its reference scales."""
         return self._smallest(delta, self.references())
 
     def largest_scaled(self, delta: Array) -> float:
-        """Return the largest of the numbers' magnitudes at `delta`, each divided by its reference scale."""
+        """Return the largest magnitude among the block's numbers at `delta`, each divided by its reference scale."""
         return float(np.max(np.abs(self.F @ delta + self.f) / self.references()))
 
     def _smallest(self, delta: Array, scale: Array) -> float:
@@ -116,19 +116,19 @@ class Block:
 
     @cached_property
     def felt(self) -> NDArray[np.intp]:
-        """Return the columns of F that are not zero: the parameters that the block depends on."""
+        """Return the indices of the parameters that the block depends on: the columns of F that are not zero."""
         return np.flatnonzero(np.any(self.F != 0.0, axis=0))
 
     def identity(self) -> Array:
-        """Return the entries of the identity matrix (or of ones), shape (entries,)."""
+        """Return the upper triangle of the identity matrix, or ones for a block of numbers, shape (entries,)."""
         return self._diagonal(np.ones(self.size or len(self.f)))
 
     def references(self) -> Array:
-        """Return the reference scale per row of the matrix or per number, shape (size,) or (entries,)."""
+        """Return the reference scale per matrix row or number, shape (size,) or (entries,); ones where none is set."""
         return np.array(self.scale) if self.scale else np.ones(self.size or len(self.f))
 
     def reference_identity(self) -> Array:
-        """Return the entries of S, the diagonal of the reference scales, shape (entries,)."""
+        """Return the upper triangle of the diagonal matrix of reference scales, shape (entries,)."""
         return self._diagonal(self.references())
 
     def _diagonal(self, values: Array) -> Array:
@@ -138,7 +138,7 @@ class Block:
 
 
 def symmetric(entries: Array, size: int) -> Array:
-    """Fill a symmetric matrix with the entries of its upper triangle, shape (size, size, ...) from (entries, ...)."""
+    """Build symmetric matrices of the entries of their upper triangles: shape (size, size, ...) from (entries, ...)."""
     matrix = np.zeros((size, size, *entries.shape[1:]))
     for value, (i, j) in zip(entries, triangle_entries(size), strict=True):
         matrix[i, j] = matrix[j, i] = value
@@ -146,7 +146,7 @@ def symmetric(entries: Array, size: int) -> Array:
 
 
 def matrix_block(name: str, rows: list[list[Row]], scale: tuple[float, ...], index: dict[str, int]) -> Block:
-    """Return the block of a symmetric matrix whose entries are sums of link parameters."""
+    """Build the condition that a matrix with entries linear in the link parameters is positive semidefinite."""
     size = len(rows)
     F = np.zeros((size * (size + 1) // 2, len(index)))
     for entry, (i, j) in enumerate(triangle_entries(size)):
@@ -156,7 +156,7 @@ def matrix_block(name: str, rows: list[list[Row]], scale: tuple[float, ...], ind
 
 
 def linear_block(name: str, rows: Sequence[tuple[Row, float]], scale: float, index: dict[str, int]) -> Block:
-    """Return the block of numbers that are sums of link parameters and a constant, all of one unit."""
+    """Build the condition that sums of link parameters and a constant, all of one unit, are not negative."""
     F = np.zeros((len(rows), len(index)))
     for entry, (row, _) in enumerate(rows):
         for parameter, coefficient in row.items():
@@ -170,7 +170,7 @@ _ODD = {"xy": ("lz", "Lxz", "Lyz"), "yz": ("lx", "Lxy", "Lxz"), "xz": ("ly", "Lx
 
 
 def configured_blocks(config: ArmConfig, links: Sequence[int], index: Index) -> list[Block]:
-    """Return every block of the configuration that must be positive.
+    """Return the inequality conditions of a description: bounds of mass and its center, hulls, ellipsoids, signs.
 
     Args:
         config: of the arm.
@@ -193,7 +193,7 @@ def configured_blocks(config: ArmConfig, links: Sequence[int], index: Index) -> 
 
 
 def symmetries(config: ArmConfig, links: Sequence[int], index: Index) -> list[Block]:
-    """Return the odd moments that symmetry planes make zero, one block per plane; none stands twice."""
+    """Return, per symmetry plane of a link, the equalities that its odd moments are zero; none is repeated."""
     blocks = []
     for link, body in _bodies(constraints_with_payload(config), links):
         gone: set[str] = set()
@@ -275,7 +275,7 @@ def _ellipsoid(link: int, body: Ellipsoid, index: Index) -> Block:
 
 
 def signs(positive: Sequence[JointTerm], links: Sequence[int], index: Index) -> list[Block]:
-    """Return the blocks of joint terms that must be positive (eq. 28), where the model has them.
+    """Return the conditions that joint terms such as friction are positive (eq. 28), for terms that the model has.
 
     Args:
         positive: the terms.
@@ -330,7 +330,7 @@ class FeasibleSet:
     equalities: tuple[Block, ...] = field(default=())
 
     def margin(self, delta: Array) -> tuple[float, str]:
-        """Return the smallest eigenvalue of all blocks and the block it belongs to; positive inside the set."""
+        """Return the smallest eigenvalue of all blocks and its block's name; positive inside, equalities aside."""
         return min(
             (float(value), self.blocks[place].name)
             for group in self._by_size
@@ -347,19 +347,19 @@ class FeasibleSet:
 
     @cached_property
     def links(self) -> tuple[frozenset[str], ...]:
-        """Return the numbers of the links that each block depends on, as they end the names of its parameters."""
+        """Return per block the numbers (as text) of the links whose parameters it depends on."""
         return tuple(frozenset(link_of(self.names[column]) for column in block.felt) for block in self.blocks)
 
     def scaled_margin(self, delta: Array) -> tuple[float, str]:
-        """Return the largest t with D(delta) - t S >= 0, S the reference scales, and the block that limits it."""
+        """Return the largest t with D(delta) - t S >= 0, S the reference scales, and the limiting block's name."""
         return min((block.smallest_scaled(delta), block.name) for block in self.blocks)
 
     def violation(self, delta: Array) -> tuple[float, str]:
-        """Return the largest deviation from an equality, over its reference scale, and its name; zero without any."""
+        """Return the largest equality error over its scale, and the equality's name; (0, "") without equalities."""
         return max(((block.largest_scaled(delta), block.name) for block in self.equalities), default=(0.0, ""))
 
     def equality_rows(self) -> tuple[Array, Array]:
-        """Return all equalities as E delta + e = 0, over their reference scales; (rows, parameters), (rows,)."""
+        """Return E, shape (rows, parameters), and e of all equalities E delta + e = 0, divided by reference scales."""
         E = [block.F / block.references()[:, None] for block in self.equalities]
         e = [block.f / block.references() for block in self.equalities]
         return np.vstack([np.zeros((0, len(self.names))), *E]), np.concatenate([np.zeros(0), *e])
@@ -372,7 +372,7 @@ def feasible_set(
     *,
     positive: Sequence[JointTerm] = (),
 ) -> FeasibleSet:
-    """Return the feasible set of an arm, or of a bare table of parameters.
+    """Build the feasible set of named link parameters: each link's inertia, and the description's conditions.
 
     Args:
         kind: condition on the inertias.

@@ -41,7 +41,7 @@ class LinkParameterMap:
         self.of_dependent[self.dependent, np.arange(len(self.dependent))] = 1.0
 
     def delta(self, beta: Array, dependent: Array) -> Array:
-        """Return the link parameters, shape (parameters,)."""
+        """Return the link parameters with these base parameters and dependent parameters, shape (parameters,)."""
         return np.asarray(self.of_beta @ beta + self.of_dependent @ dependent)
 
 
@@ -73,7 +73,7 @@ def insets(conditions: FeasibleSet, base: BaseParameters, beta: Array) -> Array:
 
 
 def constrain(problem: ConicProblem, block: Block, F: Array, f: Array) -> None:
-    """Put a block into its cone; F and f are its affine map in the problem's own variables."""
+    """Add to the problem that F x + f is in the block's cone: positive semidefinite, or not negative for numbers."""
     if block.size == 0:
         problem.nonnegative(F, f)
     else:
@@ -93,7 +93,7 @@ def minimise(
     reaches: Sequence[float] = OF_TESTS,
     enough: float | None = None,
 ) -> Solution:
-    """Solve within the first bound on the links' tr(P) (a reach) that has an acceptable optimum.
+    """Minimise an objective; return the first acceptable optimum among bounds (reaches) on the links' tr(P).
 
     Args:
         problem: problem with all its constraints.
@@ -137,7 +137,7 @@ def minimise(
 
 
 def largest(conditions: FeasibleSet, size: float) -> float:
-    """Return the largest base parameter or bound, at least 1, which a reach is multiplied by.
+    """Return the size that bounds on tr(P) are multiples of: the largest of 1, `size` and the set's constants.
 
     Args:
         conditions: feasible set with the bounds.
@@ -148,7 +148,7 @@ def largest(conditions: FeasibleSet, size: float) -> float:
 
 
 def traces(conditions: FeasibleSet) -> Array:
-    """Return the rows tr(P_k) = m + tr(L)/2 per link, shape (links, parameters)."""
+    """Return the rows T with T delta = tr(P_k) = m + tr(L)/2 of each link, shape (links, parameters)."""
     index = {name: column for column, name in enumerate(conditions.names)}
     links = [name[1:] for name in conditions.names if name.startswith("m") and name[1:].isdigit()]
     rows = np.zeros((len(links), len(index)))
@@ -159,7 +159,7 @@ def traces(conditions: FeasibleSet) -> Array:
 
 
 def active_constraints(conditions: FeasibleSet, duals: Sequence[Array]) -> tuple[str, ...]:
-    """Return the names of the active constraints, those with a large multiplier, the most decisive first."""
+    """Return the names of blocks with a large multiplier, so at the boundary; the largest multiplier first."""
     weights = [float(np.abs(dual).max()) for dual in duals[: len(conditions.blocks)]]
     order = sorted(range(len(weights)), key=lambda i: -weights[i])
     floor = max(MULTIPLIER, 1e-3 * max(weights))
@@ -167,7 +167,7 @@ def active_constraints(conditions: FeasibleSet, duals: Sequence[Array]) -> tuple
 
 
 def project(delta: Array, conditions: FeasibleSet) -> Array:
-    """Return the nearest delta that fulfils the equalities to the last digit."""
+    """Return the delta nearest to the given one that fulfils the equalities; unchanged where the set has none."""
     E, e = conditions.equality_rows()
     if len(e) == 0:
         return delta
@@ -180,7 +180,7 @@ def project(delta: Array, conditions: FeasibleSet) -> Array:
 
 
 def check(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> None:
-    """Refuse base parameters, grouping and feasible set that do not belong together.
+    """Raise ParameterError unless base parameters, grouping and feasible set fit each other in shape and names.
 
     Raises:
         ParameterError: shapes or names do not fit.
@@ -205,7 +205,7 @@ class ConditionsError(ParameterError, SolverError):
 
 
 def conflicting_constraints(conditions: FeasibleSet) -> tuple[str, ...]:
-    """Return the names of the conditions that conflict whatever the data; none where some delta fulfils all of them.
+    """Return the names of the conditions that conflict whatever the data; empty where some delta fulfils all of them.
 
     Below the inset that every problem keeps, the multipliers of the largest margin name the blocks of the proof.
 
@@ -225,7 +225,7 @@ def conflicting_constraints(conditions: FeasibleSet) -> tuple[str, ...]:
 
 
 def interior_point(conditions: FeasibleSet) -> Array | None:
-    """Return link parameters well inside a set, shape (parameters,); None where the conditions conflict.
+    """Return link parameters with the largest margin in a set, shape (parameters,); None where the conditions conflict.
 
     Raises:
         SolverError: the solver stopped without an optimum.

@@ -69,14 +69,14 @@ class FeasibleEstimate:
         likely: LikelyBodies | None = None,
         near: ChangeEllipsoid | None = None,
     ) -> FeasibleEstimate:
-        """Return the link parameters nearest to likely ones, with these base parameters or near ones: `central.py`."""
+        """Return the estimate with link parameters centred near likely ones; base parameters may move within `near`."""
         delta = centre(self.delta, base, conditions, likely, near)
         beta = self.beta if near is None else base.K @ delta
         return replace(self, beta=beta, delta=delta, margin=conditions.margin(delta)[0])
 
 
 def add_conditions(problem: ConicProblem, conditions: FeasibleSet, to_delta: Array, inside: Array) -> None:
-    """Add every block of the set with its inset (eq. 21, `insets`) and every equality exactly; delta = to_delta x."""
+    """Add the set's conditions to a problem, delta = to_delta x: blocks with insets (eq. 21), equalities exactly."""
     for block, inset in zip(conditions.blocks, inside, strict=True):
         constrain(problem, block, block.times(to_delta), block.f - inset * block.identity())
     E, e = conditions.equality_rows()
@@ -95,7 +95,7 @@ def solve_inside(
     reaches: Sequence[float] = OF_ESTIMATES,
     enough: float | None = None,
 ) -> tuple[Array, Solution]:
-    """Solve a problem whose answer must lie inside the set.
+    """Solve a problem; return link parameters strictly inside the set and the solution; raises where there are none.
 
     Args:
         problem: problem with all its constraints, those of the set included.
@@ -149,7 +149,7 @@ def nearest(
     reaches: Sequence[float] = OF_ESTIMATES,
     enough: float | None = None,
 ) -> FeasibleEstimate:
-    """Minimise |metric b - target| over feasible b.
+    """Return the feasible base parameters b that minimise |metric b - target|; raises ConditionsError where none exist.
 
     Args:
         metric: shape (rows, base).

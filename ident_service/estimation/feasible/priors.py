@@ -69,18 +69,18 @@ class Prior:
 
     @cached_property
     def scales(self) -> Array:
-        """Return the reference scale per parameter, shape (parameters,)."""
+        """Return the reference scale of each parameter [SI], shape (parameters,)."""
         return np.array([reference(name) for name in self.names])
 
     @cached_property
     def euclidean(self) -> NDArray[np.intp]:
-        """Return the columns of delta whose squared difference counts."""
+        """Return indices of parameters compared by squared difference: all if `euclidean`, else those of joints."""
         inertial = [name.rstrip("0123456789") in INERTIAL for name in self.names]
         return np.flatnonzero(np.ones(len(self.names)) if self.kind == "euclidean" else ~np.array(inertial))
 
     @cached_property
     def whitened(self) -> tuple[Block, ...]:
-        """Return Q per link, as an affine map of delta.
+        """Return per link the pseudo-inertia whitened by the prior's, as an affine map of delta; identity at the prior.
 
         Raises:
             ParameterError: a link whose prior pseudo-inertia is not positive definite.
@@ -114,7 +114,7 @@ class Prior:
 
 
 def residual_deviation(fit: LeastSquares) -> float:
-    """Return the standard deviation of the residual that the fit's own deviations are made from (eq. 81).
+    """Return the residual's standard deviation that the parameters' deviations are made from (eq. 81).
 
     Raises:
         ParameterError: no parameter was seen, or the residual is exactly zero.
@@ -132,7 +132,7 @@ def residual_deviation(fit: LeastSquares) -> float:
 def solve_with_prior(
     fit: LeastSquares, base: BaseParameters, conditions: FeasibleSet, prior: Prior
 ) -> FeasibleEstimate:
-    """Solve the constrained least squares with a prior.
+    """Return the feasible estimate that minimises squared residuals plus the prior's weight times its divergence.
 
     Raises:
         ParameterError: the prior is about other link parameters, or the residual has no variance.
@@ -183,7 +183,7 @@ def move_off_boundary(
     likely: LikelyBodies,
     near: ChangeEllipsoid,
 ) -> FeasibleEstimate:
-    """Move an estimate off the boundary of the set, towards likely bodies, within the uncertainty `near`.
+    """Return the estimate moved into the set towards likely bodies, within `near`; unchanged where the solver fails.
 
     Newton's method (`central.py`) needs room to begin: between links of tonnes whose masses cancel there is none.
 
@@ -285,7 +285,7 @@ class WeightChoice:
 def choose_weight(
     fit_for_weight: Callable[[float], Array], score: Callable[[Array], float], grid: Sequence[float]
 ) -> WeightChoice:
-    """Return the weight whose estimate explains held-out recordings best.
+    """Return the weight with the smallest held-out score, and all scores; the larger weight of equal ones.
 
     Args:
         fit_for_weight: base parameters for a weight, shape (base,).

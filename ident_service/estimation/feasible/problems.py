@@ -39,7 +39,7 @@ _LARGEST_CONDITION = 1e13  # of the correlations, beyond which their inverse is 
 
 
 def whitening(covariance: Array, base: BaseParameters) -> Array:
-    """Return W with W^T W the inverse of a covariance, shape (base, base).
+    """Return W with W^T W the inverse of a covariance, shape (base, base); raises ParameterError if it is singular.
 
     Args:
         covariance: of the base parameters, SI units, shape (base, base).
@@ -109,7 +109,7 @@ class FeasibilityTest:
 
 
 def feasibility_test(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> FeasibilityTest:
-    """Test whether a real body could have these base parameters (BPFT, eq. 51, as a largest margin).
+    """Test whether a real body could have these base parameters: sign of the largest margin (BPFT, eq. 51).
 
     Args:
         beta: base parameters in SI units, shape (base,).
@@ -184,7 +184,7 @@ def _unequal(delta: Array, conditions: FeasibleSet) -> FeasibilityTest:
 def feasibility_correction(
     beta: Array, base: BaseParameters, conditions: FeasibleSet, covariance: Array | None = None
 ) -> FeasibleEstimate:
-    """Return the feasible base parameters nearest to `beta` (BPFC, eq. 55).
+    """Return the feasible base parameters nearest to `beta` (BPFC, eq. 55), at an inset from the set's boundary.
 
     Args:
         beta: base parameters in SI units, shape (base,).

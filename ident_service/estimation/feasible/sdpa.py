@@ -24,7 +24,7 @@ _LARGEST_MARGIN = 1e3  # as in the feasibility test: nothing may bound the margi
 
 
 def bpft_sdpa(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> str:
-    """Write BPFT (eq. 51) as a largest margin: minimise -t over (t, delta_d) with D(beta, delta_d) - t 1 >= 0.
+    """Return BPFT as SDPA text (eq. 51): minimise -t over (t, delta_d) with D(beta, delta_d) - t 1 >= 0.
 
     Args:
         beta: base parameters in SI units, shape (base,).
@@ -47,7 +47,7 @@ def bpft_sdpa(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> str
 
 
 def bpfc_sdpa(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> str:
-    """Write BPFC (eq. 55): minimise u over (u, beta, delta_d) with [[u, (b - beta)^T], [b - beta, 1]] >= 0 (eq. 54).
+    """Return BPFC (eq. 55) as SDPA text: minimise u over (u, beta, delta_d), [[u, (b - beta)^T], [b - beta, 1]] >= 0.
 
     Args:
         beta: base parameters b in SI units, shape (base,).
@@ -65,7 +65,7 @@ def bpfc_sdpa(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> str
 
 
 def fbpe_sdpa(fit: LeastSquares, base: BaseParameters, conditions: FeasibleSet) -> str:
-    """Write FBPE-OLS (eq. 74): minimise u over (u, beta, delta_d) with U_rho(u, beta) >= 0 (eq. 73).
+    """Return FBPE-OLS as SDPA text (eq. 74): minimise u over (u, beta, delta_d) with U_rho(u, beta) >= 0 (eq. 73).
 
     Args:
         fit: unconstrained estimate, for R_1, rho_1 and |rho_2|.

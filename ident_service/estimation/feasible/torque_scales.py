@@ -41,7 +41,7 @@ class ScaledEstimate:
 
 
 def scale_bounds(config: ArmConfig, joints: Sequence[str]) -> dict[int, tuple[float, float]]:
-    """Return the bounds of torque factors by joint index, from `constraints.torque_constant`.
+    """Return (smallest, largest) torque factor by joint index, for the joints in `constraints.torque_constant`.
 
     Raises:
         ParameterError: bounds for a joint that the arm does not have.
@@ -92,7 +92,7 @@ def constrained_least_squares_with_scales(
 def feasible_with_factors(
     R: Array, base: BaseParameters, conditions: FeasibleSet, guess: Array, bounds: tuple[Array, Array]
 ) -> tuple[FeasibleEstimate, Array]:
-    """Return the feasible base parameters, and bounded factors, of the smallest |R [beta; factors; 1]|.
+    """Return the feasible base parameters and the bounded factors that minimise |R [beta; factors; 1]|.
 
     Args:
         R: triangular factor, one column a base parameter, one a factor, and one of constants, shape (rows, base +
