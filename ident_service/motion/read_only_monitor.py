@@ -104,7 +104,7 @@ def watch(
     cycles: int | None = None,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> Watched:
-    """Watch an arm for some time, without torque, and summarise the samples.
+    """Open an arm read-only, exchange cycles without torque for `seconds`, close it, and summarise the samples.
 
     Args:
         arm: the arm, not open.
