@@ -30,7 +30,7 @@ class Clock(Protocol):
         """Return the monotonic time [ns]."""
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Return at or after `deadline_ns`; at once when it has passed."""
+        """Wait until `deadline_ns`; return at once when it has passed."""
 
 
 class RealClock:

@@ -170,7 +170,7 @@ class PythonCanLink:
         return frames
 
     def hear(self, frame: Frame) -> None:
-        """Let a frame be the next to be received: what the kernel tells of the controller beside the socket."""
+        """Queue a frame of the controller's state, stamped now, to be returned by a later `receive` or `drain`."""
         self._watch.observe(frame)
         self._waiting.append(frame._replace(stamp_ns=time.monotonic_ns()))
 
