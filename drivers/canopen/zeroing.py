@@ -35,7 +35,7 @@ class ZeroingArm(MonitoringArm):
         """Do nothing before the counts are taken."""
 
     def set_home(self) -> tuple[str, ...]:
-        """Store in every drive its present counts as those at home.
+        """Store in every drive its present counts as those at home; return each drive's state in words.
 
         Returns:
             The state of each drive in words.
