@@ -101,7 +101,7 @@ class JointEncoders:
         self._without = dict.fromkeys(self._radians, 0)
 
     def update(self, pucks: Sequence[MotorPuck], position: Vector) -> tuple[Vector | None, list[AxisEvent]]:
-        """Return joint positions by the encoders [rad], and an event of each joint that is apart from its motors.
+        """Return joint positions by the encoders [rad], and events of joints off their motors or with an encoder lost.
 
         Args:
             pucks: pucks at the end of a cycle.
@@ -326,7 +326,7 @@ class BarrettArm(Arm):
         self._require_open().silent = True
 
     def drive_status(self) -> tuple[AxisStatus, ...]:
-        """Return the last reported status of each puck, see `Arm`."""
+        """Return the last reported status of each puck in flags common to all fieldbuses."""
         codec = self._require_open().codec
         return tuple(axis_status(puck, codec.safety) for puck in codec.pucks)
 
@@ -354,7 +354,7 @@ class BarrettArm(Arm):
         self._enabled = True
 
     def reset(self) -> None:
-        """Clear the errors of motor pucks; what the pendant shows only a person clears.
+        """Clear the errors of motor pucks; DriverError if one stays, or the pendant shows what only a person clears.
 
         Raises:
             DriverError: not open, enabled, an error stays because its cause does, or the pendant shows a fault.

@@ -213,7 +213,7 @@ class Properties:
 
     @staticmethod
     def is_wide(name: str) -> bool:
-        """Return whether values of a property have 32 bits."""
+        """Return whether values of this property have 32 bits, not 16."""
         return name in _WIDE
 
 

@@ -321,7 +321,7 @@ def limit(port: PropertyPort, arm: FoundArm, driver: BarrettDriver) -> None:
 
 
 def ignore_jumps(port: PropertyPort, arm: FoundArm) -> None:
-    """Tell the safety puck to ignore some velocity faults, as positions jump from where nobody has asked for them."""
+    """Have the safety puck ignore some velocity faults (IFAULT), since positions jump when they are first asked for."""
     port.write(arm.safety_node, arm.safety, "IFAULT", IGNORED_FAULTS, verify=False)
 
 

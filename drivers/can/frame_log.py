@@ -88,7 +88,7 @@ class BusSession:
         self._log: SessionLog | None = None
 
     def log_frames(self, path: Path) -> None:
-        """Log every frame of the next session to a `.log` of candump's, `.asc` or `.blf`; see `Arm`."""
+        """Have the next session log every frame to this file; DriverError unless it ends in `.log`, `.asc`, `.blf`."""
         self._path = require_format(path)
 
     def logged(self) -> str:

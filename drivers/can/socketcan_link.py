@@ -148,7 +148,7 @@ _PLAUSIBLE_NS = 10_000_000_000  # a stamp older than this, or in the future, com
 
 
 def from_config(config: ArmConfig, bus_number: int) -> RawLink:
-    """Open the link of one bus of an arm; entry point `raw`.
+    """Open and return the link of one bus of an arm; entry point `raw`.
 
     Raises:
         BusError: the interface is missing, down, or without the CAN FD asked for, or this kernel has no CAN sockets.
@@ -226,7 +226,7 @@ class RawLink:
         self._dropped = 0
 
     def send(self, frame: Frame) -> None:
-        """Hand one frame to the kernel's queue.
+        """Hand one frame to the kernel's queue and return at once; BusError where the bus is off, gone or full.
 
         Raises:
             BusError: bus-off, interface down or gone, queue full.

@@ -137,7 +137,7 @@ class Drive:
 
     @property
     def axis_status(self) -> AxisStatus:
-        """Return the status in flags common to all fieldbuses; none before the first status word."""
+        """Return the status in flags common to all fieldbuses; no flag before the first status word."""
         error = 0 if self.emergency is None else self.emergency.code
         status = self.status if self.let_go is None else self.let_go
         return AxisStatus(0) if status is None else axis_status(status, error)

@@ -152,6 +152,6 @@ class Zeros:
 
 
 def zeros_of(config: ArmConfig) -> Zeros | None:
-    """Return the zeros of an arm whose encoders need them, else None; raises as `Zeros`."""
+    """Return the zeros of an arm whose encoders need them (`zero: at_home`), else None; raises as `Zeros`."""
     needed = isinstance(config.driver, CanopenDriver) and config.driver.zero == "at_home"
     return Zeros(config) if needed else None

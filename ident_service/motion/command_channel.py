@@ -456,7 +456,7 @@ class SupervisedCommands:
         return self._controls.homing
 
     def tell_homing(self, stage: Homing) -> None:
-        """Set the stage of leading a held arm home."""
+        """Set the stage of leading a held arm home; while it is `GOING`, `lease_ok` checks that lease."""
         self._controls.tell_homing(stage)
 
     @property

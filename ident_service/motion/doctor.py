@@ -92,7 +92,7 @@ class Woken:
 
     @property
     def seconds(self) -> float:
-        """Return the measured time [s]."""
+        """Return the duration of the measurement [s]: the number of slots times their period."""
         return len(self.late) * self.period
 
     def share(self, share: float) -> float:

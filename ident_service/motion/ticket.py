@@ -232,7 +232,7 @@ class Ticket:
 
     @property
     def verdict(self) -> Verdict:
-        """Return FAILED or NEEDS_PERSON if a check has it, else FAILED if an indispensable one is missing, else PASSED.
+        """Return FAILED or NEEDS_PERSON if a check has it, else PASSED if all indispensable ones passed, else FAILED.
 
         Without an indispensable check `valid_for` would allow nothing.
         """

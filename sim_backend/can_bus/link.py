@@ -152,7 +152,7 @@ _ANSWERS = {
 
 
 def from_config(config: ArmConfig, bus_number: int) -> WireLink:
-    """Open the link of one simulated bus of an arm; entry point `ident_wire`.
+    """Open and return the link of one simulated bus of an arm; entry point `ident_wire`.
 
     Raises:
         BusError: no process runs the wire, or it refuses.
@@ -282,7 +282,7 @@ class WireLink:
         self.send_all((frame,))
 
     def send_all(self, frames: Sequence[Frame]) -> None:
-        """Send several frames in one system call, in their order; raises as `send` does, and then nothing is sent."""
+        """Send frames in their order, 64 to a system call; a frame that cannot exist raises before any is sent."""
         for frame in frames:
             check_sendable(frame, fd=self._fd)
         if self._watch.off:

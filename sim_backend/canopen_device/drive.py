@@ -74,7 +74,7 @@ class VendorWatchdogs:
         self._node.stop(_TARGET)
 
     def due(self, name: str) -> None:
-        """Raise the drive's error if the timer that ran out is that of SYNC or of targets; ignore others."""
+        """Report a missing SYNC or target as an error if its timer is the one that ran out; ignore others."""
         if name in (_SYNC, _TARGET):
             self._emergency.occurs(NO_SYNC if name == _SYNC else NO_TARGET)
             self._late()

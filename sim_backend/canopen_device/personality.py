@@ -174,7 +174,7 @@ class Firmware:
         self._node, self._personality, self._control = node, personality, control
 
     def arrived(self, keys: tuple[int, ...]) -> None:
-        """Start the delay after which a mode or control word takes effect, where these keys include one."""
+        """Apply a mode or control word among these entries just written: at once in the shipped drive, else delayed."""
         for key, name, delay in ((0x606000, _MODE, _MODE_NS), (0x604000, _CONTROL, _LOOP_NS)):
             if key in keys and self._personality.shipped:
                 self.due(name)

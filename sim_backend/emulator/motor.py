@@ -31,10 +31,10 @@ class Rotor(Protocol):
     """Define the rotors of an arm, queried at any time."""
 
     def angle(self, motor: int, now_ns: int) -> float:
-        """Return the angle of a motor [rad]."""
+        """Return the angle of a motor at this time [rad]."""
 
     def speed(self, motor: int, now_ns: int) -> float:
-        """Return the speed of a motor [rad/s]."""
+        """Return the speed of a motor at this time [rad/s]."""
 
     def changes(self, now_ns: int) -> None:
         """Advance the arm to this time before something that moves it changes."""
