@@ -203,9 +203,6 @@ class Arm(ABC):
         For a person who has led the arm there, and only where encoders count from where they were when power came.
         Nothing is energised and nothing moves; until the encoders lose their power, `open` finds its positions by it.
 
-        Returns:
-            What each drive reports of itself, for people.
-
         Raises:
             DriverError: open, an arm that needs no zero, one that moves, is powered or led by another host, or that
                 cannot be had; or a drive does not keep its zero. Then none has one, or all have the one before.
@@ -242,9 +239,6 @@ class Arm(ABC):
 
         Args:
             rate: cycles per second; by default the description's.
-
-        Returns:
-            None for an arm on no bus whose load is known.
         """
         return None
 

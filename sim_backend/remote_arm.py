@@ -72,9 +72,6 @@ class PlantLaunch:
     def start(self, *, lock_step: bool) -> bool:
         """Start the process; return True once it listens, False where another plant listens there already.
 
-        Returns:
-            Whether it listens; False when another plant listens there already.
-
         Raises:
             DriverError: it cannot be started.
         """

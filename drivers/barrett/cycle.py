@@ -393,9 +393,6 @@ class PuckBus:
             counts: torque of every puck [counts]; None for none.
             asks_safety: whether the safety puck's MODE is asked for in this very cycle, beside what is due.
 
-        Returns:
-            When positions were asked for, on the link's clock [ns].
-
         Raises:
             DriverError: the bus is gone, or torques that cannot be sent, of which none has been.
         """

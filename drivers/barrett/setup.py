@@ -349,9 +349,6 @@ def zero(port: PropertyPort, arm: FoundArm, coordinates: Coordinates, home: Sequ
         coordinates: coordinates of the arm, with counts of 0 where the transmission has its zero.
         home: home position of the joints [rad or m].
 
-    Returns:
-        What was written to each puck, for people.
-
     Raises:
         DriverError: it is active, moves, or a puck does not keep its position. Then nobody counts it as zeroed.
     """

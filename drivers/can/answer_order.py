@@ -107,9 +107,6 @@ def settle_uncertain(nodes: Iterable[AnsweringNode], tell: Callable[[EventCode, 
     Args:
         nodes: of one bus.
         tell: called with the other nodes, whose answers are late.
-
-    Returns:
-        How many nodes have answered by this.
     """
     settled = 0
     for one in nodes:

@@ -546,9 +546,6 @@ def reset_farewell_fault(objects: Objects, blames: Callable[[], bool]) -> DriveS
         objects: of a drive that was off, without a fault, before it was left.
         blames: whether the drive gives another reason for a fault, which then stays.
 
-    Returns:
-        The state in which the drive is at last.
-
     Raises:
         DriverError: it does not answer, or refuses control words.
     """

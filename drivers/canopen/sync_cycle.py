@@ -319,9 +319,6 @@ class Buses:
         Args:
             counts: torque of every drive [per mille of rated torque]; None for SYNC alone.
 
-        Returns:
-            When SYNC was sent, on the link's clock [ns].
-
         Raises:
             DriverError: a bus is gone, or torques that cannot be sent, of which none has been.
         """

@@ -37,9 +37,6 @@ class ZeroingArm(MonitoringArm):
     def set_home(self) -> tuple[str, ...]:
         """Store in every drive its present counts as those at home; return each drive's state in words.
 
-        Returns:
-            The state of each drive in words.
-
         Raises:
             DriverError: not open, an arm without `zero: at_home`, a drive that does not answer, is powered, or cannot
                 keep its zero, another host, or an arm that moves: nothing has changed. Or a drive failed while zeroes

@@ -215,9 +215,6 @@ class ControlFile:
             path: path of the file, which is made where it is missing.
             now_ns: the clock of `take`.
 
-        Returns:
-            The id of the process that moves the arm; None where none does.
-
         Raises:
             UsageError: the file cannot be written; an arm that moves has been stopped all the same.
         """

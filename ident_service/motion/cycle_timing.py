@@ -180,9 +180,6 @@ class Deadlines:
             stamp_ns: of its sample [ns].
             woken_ns: the loop's clock after the exchange [ns].
             doubt_ns: how much earlier than its stamp the sample may have been taken [ns].
-
-        Returns:
-            The fault found, if any.
         """
         period = self._period_ns
         self.elapsed = self._of(stamp_ns, doubt_ns)

@@ -122,7 +122,7 @@ class FaultStore:
     def ended(self) -> None:
         """Remove the mark of a moving arm; where the mark itself stores faults, note in it that the motion has ended.
 
-        A mark that stores faults itself stays until they are acknowledged.
+        A mark that stores faults stays until they are acknowledged.
 
         Raises:
             UsageError: a file is damaged, or cannot be written.

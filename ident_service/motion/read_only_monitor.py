@@ -113,9 +113,6 @@ def watch(
         cycles: number of cycles to watch, instead of `seconds`.
         stop_requested: called every cycle; True ends watching with what has been seen.
 
-    Returns:
-        The summary.
-
     Raises:
         UsageError: no time to watch, or more than a day.
         DriverError: the arm cannot be opened or does not answer.

@@ -425,7 +425,8 @@ class SafetyMonitor:
             wanted: torque demanded by the controller [N m or N], shape (joints,).
 
         Returns:
-            The torque that may leave: within limits, or zero when the fault takes torque away.
+            The torque that may leave: within limits, or zero when the fault takes torque away. The first one is not
+            limited in rate, because the support yields to it.
         """
         limit, before, motors = self._limits.torque, self._sent, self._limits.motors
         size = np.abs(wanted)
@@ -471,7 +472,7 @@ class SafetyMonitor:
 
         Returns:
             The position that may leave: no farther from the last one than the joints move in a cycle at `VELOCITY_STOP`
-            times their velocity limit; the last one when the fault ends motion.
+            times their velocity limit, first from where the arm stands; the last one when the fault ends motion.
         """
         finite = np.isfinite(wanted)
         if not finite.all():

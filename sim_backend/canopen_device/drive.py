@@ -514,9 +514,6 @@ class CanopenDrive:
         Args:
             frame: frame of any kind; one that is not for this drive does nothing.
             now_ns: present time [ns], not before that of the last call.
-
-        Returns:
-            What the drive sends, in order.
         """
         if frame.error or frame.extended:
             return []

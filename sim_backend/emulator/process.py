@@ -313,9 +313,6 @@ def emulate(
         stop_requested: called all the time; True ends the emulation.
         commands: function that returns the next line of commands, None while there is none; never waits.
 
-    Returns:
-        The summary.
-
     Raises:
         UsageError: as `emulated_buses`; a malformed fault.
         DriverError: as `build_emulator`, an interface that cannot be had or is lost.
