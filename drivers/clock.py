@@ -70,7 +70,7 @@ class VirtualClock:
 
 
 def utc_offset_of_recording_ns(clock: Clock) -> int:
-    """Return what a recording adds to a clock's stamps so that they are in UTC [ns].
+    """Return the offset from a clock's stamps to UTC [ns]; of virtual time to now, or to SOURCE_DATE_EPOCH.
 
     Virtual time begins at zero, which viewers and `ros2 bag` show as 1970. Its recordings are laid so that now is now,
     or the second that the environment variable SOURCE_DATE_EPOCH names, for recordings that repeat to the byte.

@@ -179,7 +179,7 @@ def from_config(
     faults: Sequence[Fault] = (),
     observer: Callable[[Truth], None] | None = None,
 ) -> SimulatedArm | RemoteArm:
-    """Create the arm of a configuration with a simulated driver, at its home position and at rest.
+    """Create the arm of a simulated driver, at home and at rest; its plant in another process where so configured.
 
     Args:
         config: configuration; its driver's truth, or else its prior, becomes the plant.

@@ -60,7 +60,7 @@ def active_faults(faults: Sequence[Fault], cycle: int) -> tuple[Fault, ...]:
 
 
 def configured_faults(faults: Sequence[SimulatedFault], names: Sequence[str], period: float) -> tuple[Fault, ...]:
-    """Convert configured faults to cycles and joint numbers.
+    """Convert configured faults to ones by cycle and joint number; DriverError for an unknown joint.
 
     Args:
         faults: faults of the driver section.

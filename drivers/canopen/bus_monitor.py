@@ -86,7 +86,7 @@ class BusListener:
                 self.take(bus, frame)
 
     def nmt_words(self, place: Place, now_ns: int, patience_ns: int) -> str:
-        """Describe a node's NMT state for people, as of now.
+        """Describe a node's NMT state as heard last, and whether its heartbeat is missing by now, in words.
 
         Args:
             place: bus and node number.

@@ -68,7 +68,7 @@ class FoundNode:
 
     @property
     def is_drive(self) -> bool:
-        """Return whether the node says that it is a drive of CiA 402."""
+        """Return whether the node says by its device type (1000h) that it is a drive of CiA 402."""
         return self.device_type is not None and self.device_type & 0xFFFF == DRIVE_PROFILE
 
 

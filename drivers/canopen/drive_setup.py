@@ -250,7 +250,7 @@ class DriveConfiguration:
 
     @property
     def limit_counts(self) -> int:
-        """Return the largest torque [per mille of rated torque].
+        """Return the largest torque that the drive may give [per mille of rated torque].
 
         Where positions are streamed the drive alone can keep the joints' limits; else the host does, cycle by cycle.
         """

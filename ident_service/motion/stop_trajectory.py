@@ -102,7 +102,7 @@ _BLOCK = 4096  # samples judged at once, so that a long motion needs no more mem
 
 
 def stop(start: Setpoint, limits: MotionLimits) -> StopProfile:
-    """Return the controlled stop from any state to rest; never raises.
+    """Return the controlled stop from any state to rest, within acceleration and jerk limits; never raises.
 
     Args:
         start: state at the beginning, with arrays of shape (joints,), or (samples, joints) for many stops at once.

@@ -247,7 +247,7 @@ class Ticket:
         return {check.verdict for check in self.checks if check.code == code}
 
     def valid_for(self, subject: Subject, now: datetime) -> list[str]:
-        """Return the reasons why this ticket does not allow a motion now; empty where it does.
+        """Return why this ticket does not allow a motion: checks, expiry, other arm, motion or software; or nothing.
 
         Args:
             subject: subject of the motion that is to begin, with the open arm's own description. One without a motion,
@@ -311,7 +311,7 @@ def _difference(checked: Sequence[str], found: Sequence[str]) -> str:
 
 
 def subject_of(model: ArmModel, excitation: Excitation | None, described: ArmDescription | None) -> Subject:
-    """Return the subject that a ticket must have to allow this motion on this arm.
+    """Return the subject, names and hashes of arm, motion, model, drives and software, that a ticket must have.
 
     Args:
         model: of the arm.

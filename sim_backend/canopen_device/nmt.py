@@ -144,7 +144,7 @@ class Nmt:
                 self._found(_HOST)
 
     def heard(self, frame: Frame) -> None:
-        """Process a heartbeat of another node."""
+        """Process a heartbeat of another node: if it is awaited, start to wait for the next, and end its absence."""
         number = frame.identifier - 0x700
         for subindex in _CONSUMERS:
             entry = self._node.objects.number(0x1016, subindex)

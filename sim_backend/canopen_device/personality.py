@@ -67,7 +67,7 @@ class DriveProperties:
     mode_when_on: bool = False
 
     def reach(self, objects: Objects) -> int:
-        """Return the largest torque that the drive's limits let through [counts]."""
+        """Return the largest torque that all limits of the drive let through, the smallest of them [counts]."""
         found = [0x7FFF]
         for key, per, below in self.limits:
             if key in objects.entries:

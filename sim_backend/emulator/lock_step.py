@@ -47,7 +47,7 @@ class LockStepBus:
         return frame._replace(fd=True) if self.fd and not (frame.remote or frame.error) else frame
 
     def duration_ns(self, frame: Frame) -> int:
-        """Return the duration of a frame [ns]."""
+        """Return the duration of a frame on this bus, without stuff bits [ns]."""
         # A length that only CAN FD has takes its bits on any bus: tests send such frames, no controller does.
         kind = len(frame.data), len(frame.data) > _CLASSIC or (self.fd and not (frame.remote or frame.error))
         if (known := self._durations.get(kind)) is None:

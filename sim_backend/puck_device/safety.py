@@ -120,7 +120,7 @@ class EmulatedSafetyPuck:
         return min(due, default=None)
 
     def power_up(self, now_ns: int) -> None:
-        """Start the firmware; the arm is idle."""
+        """Start the firmware at this time; mode, pendant and faults stay as they are."""
         self._now_ns = now_ns
 
     def listens(self, identifier: int) -> bool:
