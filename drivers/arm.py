@@ -40,7 +40,7 @@ class StopKind(Enum):
 
 
 def read_only(array: _Numbers) -> _Numbers:
-    """Make an array read-only, and return it: samples stay what they were."""
+    """Make an array read-only in place, and return it."""
     array.setflags(write=False)
     return array
 
@@ -175,7 +175,7 @@ class SetupCheck:
 
 
 def require_set_up(checks: Iterable[SetupCheck]) -> None:
-    """Raise DriverError, which says what to do, where a value is not the expected one."""
+    """Raise DriverError, with the remedies, where a check's value is not the expected one."""
     if wrong := [one for one in checks if not one.good]:
         remedies = dict.fromkeys(one.remedy for one in wrong if one.remedy)
         raise DriverError(". ".join((f"cannot be enabled: {'; '.join(map(str, wrong))}", *remedies)))
@@ -189,7 +189,7 @@ class Arm(ABC):
     still_wanted: Callable[[], bool] = staticmethod(lambda: True)
 
     def look(self) -> Arm:
-        """Return the same hardware as an arm that can only be observed, not open; this one must not be open beside it.
+        """Return a closed arm for the same hardware that can only be observed; not to be opened beside this one.
 
         Of what is returned only `open`, `describe`, `exchange(None)` and `close` are used, and none of them sends a
         command, changes what a drive does or is configured to do, or keeps its watchdog quiet. It may be slower
@@ -198,13 +198,10 @@ class Arm(ABC):
         return self
 
     def zero(self) -> tuple[str, ...]:
-        """Set the present position of the arm as the home of its description; it must not be open.
+        """Set the present position of the closed arm as its configured home; return in words what each drive reports.
 
         For a person who has led the arm there, and only where encoders count from where they were when power came.
         Nothing is energised and nothing moves; until the encoders lose their power, `open` finds its positions by it.
-
-        Returns:
-            What each drive reports of itself, for people.
 
         Raises:
             DriverError: open, an arm that needs no zero, one that moves, is powered or led by another host, or that
@@ -213,7 +210,7 @@ class Arm(ABC):
         raise DriverError("this arm knows where it stands whenever it is opened; there is no zero to be set")
 
     def log_frames(self, path: Path) -> None:
-        """Keep every frame of the fieldbus of the next session, from `open` to `close`.
+        """Have the next session, `open` to `close`, log every fieldbus frame to a new file; DriverError if it cannot.
 
         Args:
             path: of the file, which must not exist when the arm is opened; its suffix says its format.
@@ -232,24 +229,21 @@ class Arm(ABC):
         return ()
 
     def withhold(self, kind: str) -> None:  # noqa: B027 - nothing to do where watchdogs watch torque frames
-        """Stop sending what watchdogs of one kind watch, until the next `stop`, and go on with everything else.
+        """Stop sending what watchdogs of one kind watch, until the next `stop`, so that they act; go on with the rest.
 
         Watchdogs of torque frames need none of it: `exchange(None)` withholds those.
         """
 
     def bus_budget(self, rate: float | None = None) -> Budget | None:
-        """Return what this arm's frames cost on its buses; it need not be open.
+        """Return the load of this arm's frames on its buses at `rate`, open or not; None where no load is known.
 
         Args:
             rate: cycles per second; by default the description's.
-
-        Returns:
-            None for an arm on no bus whose load is known.
         """
         return None
 
     def setup_checks(self) -> tuple[SetupCheck, ...]:
-        """Return what drives and buses of the open arm report of themselves, compared with what they must.
+        """Return what drives and buses of the open arm report of themselves, each value beside the expected one.
 
         An arm of which one is not `good` refuses to be enabled.
         """
@@ -257,15 +251,15 @@ class Arm(ABC):
 
     @property
     def operator_action(self) -> str:
-        """Return what a person must do for `enable` to come about, in words; empty where the host enables alone."""
+        """Return in words what a person must do to let `enable` succeed; empty where the host enables alone."""
         return ""
 
     def drive_status(self) -> tuple[AxisStatus, ...]:
-        """Return what each drive has reported last, in the order of `watchdogs`."""
+        """Return the status that each drive has reported last, in the order of `watchdogs`; empty where none does."""
         return ()
 
     def unconfirmed(self) -> tuple[str, ...]:
-        """Return which drives did not confirm that they are off when the arm was closed last, and why, in words.
+        """Return in words which drives did not confirm at the last closing that they are off, and why; empty if none.
 
         One of these may have power, or will miss its host. Also which have restarted while the arm was open, as it may
         have shown as silence only. Empty where nothing is to be told, and for drivers that cannot tell.
@@ -282,7 +276,7 @@ class Arm(ABC):
 
     @abstractmethod
     def enable(self) -> None:
-        """Energise all axes with zero torque; what a watchdog or a quick stop left behind ends with it.
+        """Energise all axes with zero torque, waiting for a person where one must; ends watchdog and quick-stop states.
 
         Where a person enables the arm (`operator_action`), it waits for that; the arm may have moved meanwhile, and
         whoever has planned from where it stood looks again.
@@ -296,7 +290,7 @@ class Arm(ABC):
 
     @abstractmethod
     def reset(self) -> None:
-        """Clear the faults that drives have latched: their own, an emergency stop, their watchdog.
+        """Clear the faults that drives have latched, their own, an emergency stop or a watchdog; energises nothing.
 
         For a person who knows why; no loop calls it. Nothing is energised by it, and an axis that is braked stays
         braked: an arm without brakes must not fall because a fault is forgotten. Without anything latched it does
@@ -339,7 +333,7 @@ class Arm(ABC):
 
     @abstractmethod
     def stop(self, kind: StopKind) -> None:
-        """Stop from any state, any number of times; never raises.
+        """Stop the drives by torque off or a quick stop, from any state, any number of times; never raises.
 
         The torque of the last sample ends with its period at the latest.
         """

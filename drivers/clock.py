@@ -30,7 +30,7 @@ class Clock(Protocol):
         """Return the monotonic time [ns]."""
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Return at or after `deadline_ns`; at once when it has passed."""
+        """Wait until `deadline_ns`; return at once when it has passed."""
 
 
 class RealClock:
@@ -70,7 +70,7 @@ class VirtualClock:
 
 
 def utc_offset_of_recording_ns(clock: Clock) -> int:
-    """Return what a recording adds to a clock's stamps so that they are in UTC [ns].
+    """Return the offset from a clock's stamps to UTC [ns]; of virtual time to now, or to SOURCE_DATE_EPOCH.
 
     Virtual time begins at zero, which viewers and `ros2 bag` show as 1970. Its recordings are laid so that now is now,
     or the second that the environment variable SOURCE_DATE_EPOCH names, for recordings that repeat to the byte.

@@ -97,6 +97,7 @@ class SimulatedArm(Arm):
 
     @faults.setter
     def faults(self, faults: Sequence[Fault]) -> None:
+        """Set the faults to inject, by cycle since `open`, in place of those before."""
         self._machine.faults = tuple(faults)
 
     def open(self) -> None:
@@ -118,12 +119,12 @@ class SimulatedArm(Arm):
         self._machine.enable()
 
     def reset(self) -> None:
-        """Clear what the drives have latched; see `Arm`; raises DriverError when not open."""
+        """Clear the faults that the drives have latched; raises DriverError when not open."""
         self._require_open()
         self._machine.reset()
 
     def exchange(self, torque: Vector | None) -> Sample:
-        """Exchange one cycle; see `Arm`; None while enabled lets the last torque act on, as drives do.
+        """Advance the plant by one cycle, apply the torque, or the last one on None, and return the sample.
 
         Raises:
             DriverError: as in the contract; or the plant ran away, or a fault took the bus, both of which use up
@@ -158,7 +159,7 @@ class SimulatedArm(Arm):
         )
 
     def stop(self, kind: StopKind) -> None:
-        """End torque: the torque of the last sample acts until its period ends, then drives are off, or brake first."""
+        """End torque when the last sample's period ends; then the drives are off, or brake first, by the kind."""
         self._machine.stop(kind)
 
     def close(self) -> None:
@@ -178,7 +179,7 @@ def from_config(
     faults: Sequence[Fault] = (),
     observer: Callable[[Truth], None] | None = None,
 ) -> SimulatedArm | RemoteArm:
-    """Create the arm of a configuration with a simulated driver, at its home position and at rest.
+    """Create the arm of a simulated driver, at home and at rest; its plant in another process where so configured.
 
     Args:
         config: configuration; its driver's truth, or else its prior, becomes the plant.

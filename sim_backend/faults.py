@@ -42,11 +42,11 @@ class Fault:
 
     @property
     def axes(self) -> slice:
-        """Return the axes that the fault strikes."""
+        """Return the slice of axes that the fault strikes: one, or all."""
         return slice(None) if self.joint is None else slice(self.joint, self.joint + 1)
 
     def strikes(self, cycle: int) -> bool:
-        """Return whether the fault strikes in this cycle."""
+        """Return whether the fault strikes in this cycle, by its first cycle, its duration, or its kind's rule."""
         if cycle < self.at_cycle:
             return False
         if self.duration is None:
@@ -60,7 +60,7 @@ def active_faults(faults: Sequence[Fault], cycle: int) -> tuple[Fault, ...]:
 
 
 def configured_faults(faults: Sequence[SimulatedFault], names: Sequence[str], period: float) -> tuple[Fault, ...]:
-    """Convert configured faults to cycles and joint numbers.
+    """Convert configured faults to ones by cycle and joint number; DriverError for an unknown joint.
 
     Args:
         faults: faults of the driver section.
@@ -124,7 +124,7 @@ class Feedback:
     def receive(
         self, fresh: Vector, status: tuple[int, ...], faults: Sequence[Fault]
     ) -> tuple[Vector, Flags, Counts, tuple[int, ...]]:
-        """Return one cycle's answers as the faults of that cycle change them.
+        """Return positions, validity, ages and status words of a cycle, as its faults change them; keeps them.
 
         Args:
             fresh: positions that the encoders show [rad or m], shape (joints,); kept.

@@ -52,13 +52,13 @@ class Schedule:
         self.restart()
 
     def restart(self) -> None:
-        """Start again before the first cycle."""
+        """Start again: the next cycle is the first, whenever it comes."""
         self._first_ns: int | None = None
         self.stamp_ns = self._slip_ns = 0
 
     @property
     def tick(self) -> int:
-        """Return the periods from the first stamp to the present one."""
+        """Return the number of periods from the first stamp to the present one."""
         return 0 if self._first_ns is None else (self.stamp_ns - self._first_ns) // self._period_ns
 
     def wait(self, faults: Sequence[Fault]) -> int:
@@ -77,7 +77,7 @@ class Schedule:
         return self.stamp_ns
 
     def sample_stamp_ns(self, faults: Sequence[Fault]) -> int:
-        """Return the stamp that a sample gives for the present cycle [ns]."""
+        """Return the stamp that a sample gives for the present cycle [ns]: the true one plus clock-jump faults."""
         jumps = [fault.size for fault in active_faults(faults, self.tick) if fault.kind is FaultKind.CLOCK_JUMP]
         return self.stamp_ns + round(sum(jumps) * 1e9)
 
@@ -165,7 +165,7 @@ class Drives:
 
     @property
     def status(self) -> tuple[int, ...]:
-        """Return the bits of `AxisStatus` per axis."""
+        """Return the `AxisStatus` bits of each axis."""
         return self._words
 
     @property
@@ -209,7 +209,7 @@ class Drives:
         return None
 
     def latch(self, torque: Vector | None, faults: Sequence[Fault]) -> Vector:
-        """Begin the period from this stamp to the next.
+        """Queue the demanded torque and begin a period; return the torque that acts in it, after the delay.
 
         Args:
             torque: demanded torque [N m or N], shape (joints,); None asks for the last one again, and is no torque
@@ -227,7 +227,7 @@ class Drives:
         return self._begin(faults)
 
     def hold(self, faults: Sequence[Fault]) -> None:
-        """Begin a period in which no frame came at all."""
+        """Begin a period in which no frame came at all, which counts for the watchdog."""
         self._silent += 1
         self._begin(faults)
 
@@ -428,7 +428,7 @@ class SimulatedHardware:
         self._drives.restart()
 
     def enable(self) -> None:
-        """Energise with zero torque.
+        """Energise with zero torque; raises DriverError where a fault strikes or is latched, and switches off then.
 
         Raises:
             DriverError: a fault forbids it that struck in the last cycle or is latched; the drives are off then.
@@ -444,7 +444,7 @@ class SimulatedHardware:
         self._drives.enable()
 
     def reset(self) -> None:
-        """Clear what the drives have latched; nothing is energised.
+        """Clear the faults that drives have latched, energising nothing; DriverError if enabled or a cause persists.
 
         Raises:
             DriverError: enabled, or the cause of a fault is still there.
@@ -461,7 +461,7 @@ class SimulatedHardware:
         self._drives.release(kind)
 
     def cycle(self, torque: Vector | None) -> Reading:
-        """Begin a period with a frame.
+        """Begin a period with a frame, with a torque or without, and return the reading at its stamp.
 
         Args:
             torque: finite [N m or N], shape (joints,), or None to look.
@@ -481,7 +481,7 @@ class SimulatedHardware:
         return Reading(position, acting, valid, age, self._feedback.lost, status, int(age.max()))
 
     def hold(self) -> None:
-        """Begin a period in which no frame came."""
+        """Begin a period in which no frame came, which counts for the watchdog."""
         self._drives.hold(self._begin())
 
     def advance(self) -> None:
@@ -518,7 +518,7 @@ class SimulatedHardware:
 
 
 def checked_torque(torque: Vector | None, enabled: bool, joints: int) -> Vector | None:
-    """Return a torque that may be sent, or None for a cycle without torque.
+    """Return the torque as an array, or None for None; DriverError if not enabled, misshapen or not finite.
 
     Raises:
         DriverError: a torque for an arm that is not enabled, of another shape, or not finite.
@@ -536,7 +536,7 @@ def checked_torque(torque: Vector | None, enabled: bool, joints: int) -> Vector 
 
 
 def description(machine: SimulatedHardware) -> ArmDescription:
-    """Return the description of a simulated arm."""
+    """Return the description of a simulated arm: joints, rate, limits, resolutions, watchdog and delay."""
     names = machine.plant.chain.names
     return ArmDescription(
         joint_names=names,

@@ -46,7 +46,7 @@ _ROUNDS = 500
 
 
 def stick_slip_velocity(A: Vector, b: Vector, bound: Vector, guess: Vector) -> Vector:
-    """Solve for the velocities; joints that stick come back with exactly 0.
+    """Solve A v + friction = b for v, with dry friction up to `bound`; joints that stick come back with exactly 0.
 
     Args:
         A: symmetric positive definite, shape (joints, joints).
@@ -145,11 +145,11 @@ class Imperfections:
         return cls(np.zeros(joints), np.zeros(joints), np.zeros(joints), np.full(joints, np.inf))
 
     def encode(self, position: Vector) -> Vector:
-        """Return the position that encoders show, a new array of shape (joints,)."""
+        """Return the position in whole encoder steps, a new array of shape (joints,)."""
         return _in_steps(position, self._encoder_steps)
 
     def drive(self, torque: Vector) -> Vector:
-        """Return the torque that drives give for a request, a new array of shape (joints,)."""
+        """Return the torque in the drives' steps, within their limits, a new array of shape (joints,)."""
         least, most = self._range
         return np.asarray(np.minimum(np.maximum(_in_steps(torque, self._torque_steps), least), most))
 
@@ -272,11 +272,11 @@ class Plant:
 
     @property
     def conditions(self) -> tuple[object, ...]:
-        """Return what a step depends on besides its torque and period; each of these is replaced when it changes."""
+        """Return the objects that a step depends on besides torque and period, to be compared by identity."""
         return self._position, self._velocity, self._acceleration, self._braking, self._loads
 
     def brake(self, damping: Array) -> None:
-        """Add viscous friction to every step from now on.
+        """Set the viscous friction that brakes every step from now on, in place of that set before.
 
         Args:
             damping: [N m s/rad or N s/m], shape (joints,), none negative; or, where drives move several joints each,
@@ -318,7 +318,7 @@ class Plant:
         self._build(delta)
 
     def step(self, torque: Array, period: float | None = None) -> None:
-        """Advance under a constant torque.
+        """Advance the state by one period, or `period` [s], under a constant torque; DriverError if it diverges.
 
         Args:
             torque: [N m or N], shape (joints,).
@@ -330,11 +330,11 @@ class Plant:
         self.take(self.after(torque, period))
 
     def take(self, state: PlantState) -> None:
-        """Take over a state that `after` has returned."""
+        """Set the plant to a state that `after` has returned."""
         self._position, self._velocity, self._acceleration, self._rate = state
 
     def after(self, torque: Array, period: float | None = None) -> PlantState:
-        """Return the state after a step, and leave the plant where it is; arguments and errors as for `step`."""
+        """Return the state to which `step` would lead, and leave the plant where it is."""
         h = self._period if period is None else period
         if h != self._stepped:
             self._stepped, self._half = h, 0.5 * h

@@ -62,24 +62,24 @@ class PlantStatistics:
         self.write()
 
     def serve(self, pid: int) -> None:
-        """Record that a client has connected."""
+        """Record that a client with this pid has connected, and enter SERVING."""
         self._clients, self._client_pid = self._clients + 1, pid
         self.heard()
         self.enter(PlantState.SERVING)
 
     def settle(self) -> None:
-        """Record that the client is gone."""
+        """Record that the client is gone: enter AT_REST where the arm is supported, else SETTLING."""
         self._client_pid = 0
         self.enter(PlantState.AT_REST if self._machine.supported else PlantState.SETTLING)
 
     def enter(self, state: PlantState, *, quiet: int = 0) -> None:
-        """Enter a state, and count the last `quiet` periods, in which the arm rested, as silent no more."""
+        """Enter a state and write the record; take `quiet` periods, in which the arm rested, off the silent ones."""
         self.state = state
         self.silent_ticks -= quiet
         self.write()
 
     def end(self) -> None:
-        """Record that the process ends."""
+        """Record that the process ends, and whether the arm is at rest or moves then."""
         resting = self.state is PlantState.AT_REST or self._machine.supported
         self.enter(PlantState.ENDED_AT_REST if resting else PlantState.ENDED_MOVING)
 
@@ -91,7 +91,7 @@ class PlantStatistics:
         self._silent_torque[:] = 0.0
 
     def moved(self, *, silent: bool) -> None:
-        """Record the motion of a period that is over."""
+        """Record the extremes of a period that is over, as silent if no frame came; write them now and then."""
         plant = self._machine.plant
         speed, torque = np.abs(plant.velocity), np.abs(self._machine.torque)
         np.minimum(self._lowest, plant.position, out=self._lowest)
@@ -108,7 +108,7 @@ class PlantStatistics:
             self.write()
 
     def write(self) -> None:
-        """Write the record now."""
+        """Write the record into the status memory now."""
         plant = self._machine.plant
         record = encode_status(
             PlantStatus(
@@ -364,7 +364,7 @@ class PlantProcess:
 def start_document(
     config: ArmConfig, faults: tuple[Fault, ...], address: str, status: int, *, lock_step: bool
 ) -> dict[str, object]:
-    """Return the document that a plant process reads from its standard input; see `main`."""
+    """Return the JSON object that a plant process reads from its standard input; see `main`."""
     listed = [[f.at_cycle, f.kind.value, f.joint, f.duration, f.size, f.offset] for f in faults]
     return {
         "address": address,
@@ -386,7 +386,7 @@ def _leave_the_core() -> None:
 
 
 def main() -> int:
-    """Read one line of JSON from standard input, serve, and end when told to or abandoned.
+    """Serve the plant that JSON on standard input describes; return 0 after it or if its address is in use, else 1.
 
     Says `ready`, `in use` (of the address) or an error, in one line on standard output.
     """

@@ -87,7 +87,7 @@ class PlantStatus:
 
     @property
     def came_to_rest(self) -> bool:
-        """Return whether nothing moves and no client drives the arm."""
+        """Return whether the recorded state is at rest with no client, the process running or ended."""
         return self.state in (PlantState.AT_REST, PlantState.ENDED_AT_REST)
 
     @property

@@ -70,10 +70,7 @@ class PlantLaunch:
         self._finalizer: weakref.finalize[..., PlantLaunch] = weakref.finalize(self, os.close, self.status)
 
     def start(self, *, lock_step: bool) -> bool:
-        """Start the process and wait until it listens.
-
-        Returns:
-            Whether it listens; False when another plant listens there already.
+        """Start the process; return True once it listens, False where another plant listens there already.
 
         Raises:
             DriverError: it cannot be started.
@@ -128,7 +125,7 @@ def _end(process: subprocess.Popen[bytes], status: int) -> None:
 
 
 def address_of(bus: str | None) -> str:
-    """Return the abstract address of a user's bus; without a name, one that nobody else knows."""
+    """Return the socket address of this user's plant of that name; a random one without a name."""
     name = f"{os.getpid()}-{secrets.token_hex(8)}" if bus is None else f"bus-{bus}"
     return f"ident-plant-{os.getuid()}-{name}"
 
@@ -244,12 +241,12 @@ class RemoteArm(Arm):
         self._enabled = True
 
     def reset(self) -> None:
-        """Clear what the drives have latched; see `Arm`; raises DriverError when not open."""
+        """Clear the faults that the drives have latched; raises DriverError when not open."""
         self._require_open()
         self._done(self._ask(wire.Reset(), self._deadline))
 
     def exchange(self, torque: Vector | None) -> Sample:
-        """Exchange one cycle; see `Arm`; a cycle without a torque is silence for the drives' watchdog.
+        """Send the torque, or none, to the plant process, and return its sample of the next cycle.
 
         Raises:
             DriverError: as in the contract; a fault took the bus; or the plant did not answer within the deadline,
@@ -287,7 +284,7 @@ class RemoteArm(Arm):
         )
 
     def stop(self, kind: StopKind) -> None:
-        """End torque with this period; drives that do not receive this stop by their own watchdog."""
+        """End torque with this period by a message to the plant; drives that miss it stop by their own watchdog."""
         self._enabled = False
         if self._socket is not None:
             with suppress(DriverError):
@@ -307,7 +304,7 @@ class RemoteArm(Arm):
             self._launch = None
 
     def plant_status(self) -> PlantStatus:
-        """Return the status of the plant.
+        """Return the status record of the plant, from its configured file or its own memory.
 
         Raises:
             DriverError: this arm has not started it, and no status file is configured; or it has not said anything.

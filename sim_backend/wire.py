@@ -158,7 +158,7 @@ class MalformedFrame(DriverError):
 
 
 def encode(frame: Request | Reply, number: int, joints: int) -> bytes:
-    """Encode a frame as bytes.
+    """Encode a request or a reply as bytes, with its number.
 
     Args:
         frame: frame with arrays of shape (joints,).
@@ -179,7 +179,7 @@ def encode(frame: Request | Reply, number: int, joints: int) -> bytes:
 
 
 def decode_request(data: bytes, joints: int) -> tuple[int, Request]:
-    """Decode number and frame of a client's request.
+    """Decode a client's request, and return its number and the frame; raises MalformedFrame otherwise.
 
     Raises:
         MalformedFrame: not a request to an arm of so many joints.
@@ -191,7 +191,7 @@ def decode_request(data: bytes, joints: int) -> tuple[int, Request]:
 
 
 def decode_reply(data: bytes, joints: int) -> tuple[int, Reply]:
-    """Decode number and frame of a plant's reply.
+    """Decode a plant's reply, and return its number and the frame; raises MalformedFrame otherwise.
 
     Raises:
         MalformedFrame: not a reply of an arm of so many joints.
@@ -249,5 +249,5 @@ def text_of(failed: Failed) -> str:
 
 
 def failed(error: Exception) -> Failed:
-    """Convert an error to a frame, cut where it is too long."""
+    """Create the reply that reports an error, its text cut to the frame's length."""
     return Failed(str(error).encode()[:_TEXT])

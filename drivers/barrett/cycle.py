@@ -155,7 +155,7 @@ class PuckCodec:
 
     @property
     def late(self) -> int:
-        """Return how many positions were late or second, of all pucks together."""
+        """Return how many positions came too late or a second time in a cycle, of all pucks together."""
         return sum(puck.late for puck in self.pucks)
 
     @property
@@ -164,7 +164,7 @@ class PuckCodec:
         return self._missing == 0
 
     def torque_frames(self, counts: Sequence[int]) -> list[Frame]:
-        """Return the frames that carry a torque to every puck [counts], in the arm's order; raises DriverError."""
+        """Return the frames that carry a torque to every puck [counts], in the arm's order; DriverError if too big."""
         frames = []
         for group, members in self._slots:
             slots = [0, 0, 0, 0]
@@ -175,11 +175,11 @@ class PuckCodec:
 
     @property
     def reasons(self) -> list[Frame]:
-        """Return the frames that ask the safety puck why the arm is not active."""
+        """Return the frames that ask the safety puck for MODE and PEN: why the arm is not active."""
         return [get(self.safety.node, self._safety.number(name)) for name in ("MODE", "PEN")]
 
     def questions(self) -> list[Frame]:
-        """Return the frames that ask for the state of everybody, in the order in which they are sent."""
+        """Return the frames that ask all pucks for MODE and their state, in the order in which they are sent."""
         mode = get(self.safety.node, self._safety.number("MODE"))
         pendant = get(self.safety.node, self._safety.number("PEN"))
         frames = [mode]
@@ -192,7 +192,7 @@ class PuckCodec:
         return [*frames, pendant]
 
     def begin_cycle(self, now_ns: int = 0, *, asks: bool = True) -> None:
-        """Open a cycle after positions have been asked for: from now on each puck may answer once.
+        """Begin a cycle after positions were requested: each puck may answer once, and its data is a cycle older.
 
         Args:
             now_ns: time of the requests [ns of the link's clock].
@@ -209,7 +209,7 @@ class PuckCodec:
             puck.order.behind += asks
 
     def end_cycle(self) -> None:
-        """Close the cycle at its deadline: answers from now on are late."""
+        """End the cycle at its deadline: uncertain answers are decided on, and answers from now on are late."""
         self._open = False
         if self._missing:
             self._missing -= settle_uncertain(self.pucks, self._tell)
@@ -220,14 +220,14 @@ class PuckCodec:
         return taken
 
     def forget_events(self) -> None:
-        """Discard the events so far; what still ails the bus is reported anew."""
+        """Discard all events so far, so that conditions that persist are reported again."""
         self._events = []
         self._told.clear()
         if self.controller in LEFT_NORMAL:
             self._tell_controller()
 
     def receive(self, frame: Frame) -> None:
-        """Take one frame, whatever it is; never raises."""
+        """Take one received frame, whatever it is, into the state of the pucks or of the controller; never raises."""
         if frame.error:
             self._on_error(frame)
             return
@@ -329,7 +329,7 @@ class PuckCodec:
 
 
 def axis_status(puck: MotorPuck, safety: SafetyPuck) -> AxisStatus:
-    """Return the status of a motor puck in flags common to all fieldbuses."""
+    """Return a puck's status as fieldbus-independent flags: faults, emergency stop, POWERED in torque mode, or IDLE."""
     found = AxisStatus(0)
     if safety.mode == SafetyMode.ESTOP:
         found |= AxisStatus.EMERGENCY_STOP
@@ -382,19 +382,16 @@ class PuckBus:
 
     @property
     def stale(self) -> list[int]:
-        """Return the nodes that have not said their MODE for too long."""
+        """Return the nodes that have not reported their MODE for too many cycles."""
         old = [puck.node for puck in self.codec.pucks if puck.status_age > self._stale]
         return old + ([self.codec.safety.node] if self.codec.safety.status_age > self._stale else [])
 
     def cycle(self, counts: Sequence[int] | None, *, asks_safety: bool = False) -> int:
-        """Wait for the next cycle and exchange its frames.
+        """Wait for the next cycle and exchange its frames; return when positions were requested [ns of its clock].
 
         Args:
             counts: torque of every puck [counts]; None for none.
             asks_safety: whether the safety puck's MODE is asked for in this very cycle, beside what is due.
-
-        Returns:
-            When positions were asked for, on the link's clock [ns].
 
         Raises:
             DriverError: the bus is gone, or torques that cannot be sent, of which none has been.
@@ -437,7 +434,7 @@ class PuckBus:
         return stamp_ns
 
     def answers_late(self) -> bool:
-        """Leave out a request; return whether positions came all the same: answers are of a request before."""
+        """Leave out one cycle's request; return whether positions came nevertheless: answers are a request late."""
         before = self.codec.late
         self._next_ns = (self._next_ns or 0) + self._period_ns
         self.cycle(None)
@@ -480,7 +477,7 @@ _COUNTS, _TORQUE = 40_000, 500
 
 
 def budget(driver: BarrettDriver, rate: float) -> Budget:
-    """Compute the bus load of an arm's frames at a rate.
+    """Return the bus load of an arm's frames at a rate [Hz], with remedies where it does not fit.
 
     Args:
         driver: the arm's section `driver`.

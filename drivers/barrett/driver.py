@@ -73,7 +73,7 @@ class JointEncoders:
         self._position = np.full(len(names), np.nan)
 
     def checks(self, pucks: Sequence[MotorPuck]) -> tuple[SetupCheck, ...]:
-        """Compare whether pucks tell a joint encoder with the description.
+        """Return a set-up check of each puck that reports a joint encoder, or should by the description.
 
         Args:
             pucks: pucks with their answers.
@@ -89,19 +89,19 @@ class JointEncoders:
         )
 
     def begin(self, pucks: Sequence[MotorPuck], position: Vector) -> None:
-        """Take the motors' position [rad], shape (joints,), as that of the encoders."""
+        """Set the encoders' origins so that they agree with the motors' position [rad], shape (joints,)."""
         for k in self._radians:
             self._counts[k] = pucks[k].encoder or 0
             self._origin[k] = float(position[k]) - self._counts[k] * self._radians[k]
         self.forget_told()
 
     def forget_told(self) -> None:
-        """Tell anew of what has not changed: of an idle arm nobody may have acted upon it."""
+        """Reset the counts of deviations and of missing encoders, so that what persists is reported again."""
         self._beyond = dict.fromkeys(self._radians, 0)
         self._without = dict.fromkeys(self._radians, 0)
 
     def update(self, pucks: Sequence[MotorPuck], position: Vector) -> tuple[Vector | None, list[AxisEvent]]:
-        """Return joint positions by the encoders, and an event of each joint whose cables they no longer guard.
+        """Return joint positions by the encoders [rad], and events of joints off their motors or with an encoder lost.
 
         Args:
             pucks: pucks at the end of a cycle.
@@ -218,7 +218,7 @@ class BarrettArm(Arm):
         self._unconfirmed: tuple[str, ...] = ()
 
     def look(self) -> Arm:
-        """Return an arm that asks pucks for positions and states, and sets nothing.
+        """Return a closed arm on the same bus that only asks pucks for positions and states, and sets nothing.
 
         What it asks for is seen by the safety puck as well; so it asks no active arm, whose host may be the one that is
         to be missed.
@@ -226,7 +226,7 @@ class BarrettArm(Arm):
         return BarrettArm(self._config, self._open_bus, looks=True)
 
     def zero(self) -> tuple[str, ...]:
-        """Define the present position as the home of the description; see `Arm`."""
+        """Set the present position of the closed arm as its configured home; return in words what each puck got."""
         if self._bus is not None:
             raise DriverError("the arm is open; close it before it is zeroed")
         if self._looks:
@@ -243,7 +243,7 @@ class BarrettArm(Arm):
             self.close()
 
     def log_frames(self, path: Path) -> None:
-        """Log every frame of the next session; see `Arm`."""
+        """Have the next session log every frame to a new file; DriverError where its suffix names no format."""
         self._session.log_frames(path)
 
     def logged(self) -> str:
@@ -306,15 +306,15 @@ class BarrettArm(Arm):
         )
 
     def bus_budget(self, rate: float | None = None) -> Budget:
-        """Return the load of the bus, see `Arm`."""
+        """Return the load of the bus at `rate` [Hz], by default the configured one; with remedies if it is too much."""
         return budget(self._driver, self._config.control.rate if rate is None else rate)
 
     def setup_checks(self) -> tuple[SetupCheck, ...]:
-        """Return what the pucks report of themselves, and the host's controller that cannot be used, see `Arm`."""
+        """Return what pucks report of themselves beside what is expected, and a host's CAN controller in trouble."""
         return self._checks + controller_checks(self._driver.bus.channel, self._require_open().codec.controller)
 
     def watchdogs(self) -> tuple[Watchdog, ...]:
-        """Return the safety puck's watch over every puck, see `Arm`."""
+        """Return one watchdog for each puck: that of the safety puck, which acts when the bus is silent."""
         seconds, period = self._driver.heartbeat, self._period_ns * 1e-9
         # Meanwhile the safety puck is asked in every cycle whether it has acted.
         return tuple(
@@ -322,16 +322,16 @@ class BarrettArm(Arm):
         )
 
     def withhold(self, kind: str) -> None:
-        """Send neither torques nor requests for positions, which the safety puck watches; see `Arm`."""
+        """Stop sending torques and position requests, which the safety puck watches, until the next `stop`."""
         self._require_open().silent = True
 
     def drive_status(self) -> tuple[AxisStatus, ...]:
-        """Return the last reported status of each puck, see `Arm`."""
+        """Return the last reported status of each puck in flags common to all fieldbuses."""
         codec = self._require_open().codec
         return tuple(axis_status(puck, codec.safety) for puck in codec.pucks)
 
     def enable(self) -> None:
-        """Wait until a person activates the arm, with zero torque; what a lost heartbeat left behind ends with it.
+        """Wait until a person activates the arm on its pendant, with zero torque; DriverError if nobody does in time.
 
         Raises:
             DriverError: not open, only looked at, a puck says something else of itself than the description, has a
@@ -354,7 +354,7 @@ class BarrettArm(Arm):
         self._enabled = True
 
     def reset(self) -> None:
-        """Clear the errors of motor pucks; what the pendant shows only a person clears.
+        """Clear the errors of motor pucks; DriverError if one stays, or the pendant shows what only a person clears.
 
         Raises:
             DriverError: not open, enabled, an error stays because its cause does, or the pendant shows a fault.
@@ -376,7 +376,7 @@ class BarrettArm(Arm):
             raise ActionNeeded(f"the pendant shows {bus.codec.safety.pendant}; {_SHIFT_IDLE}")
 
     def exchange(self, torque: Vector | None) -> Sample:
-        """Exchange one cycle; see `Arm`.
+        """Exchange one cycle, with a torque clipped to its limits or none; return the sample.
 
         Raises:
             DriverError: as in the contract; also an arm that is looked at and has been activated.
@@ -414,7 +414,7 @@ class BarrettArm(Arm):
                 self.clock.sleep_until_ns(self.clock.now_ns() + round(_AGAIN * 1e9))
 
     def close(self) -> None:
-        """Take all pucks to IDLE and close the bus; any number of times."""
+        """Take all pucks to IDLE, wait until they report it, and close the bus and the log; any number of times."""
         self.stop(StopKind.TORQUE_OFF)
         if self._bus is not None:
             if not self._looks:
@@ -427,7 +427,7 @@ class BarrettArm(Arm):
         self._session.close()
 
     def unconfirmed(self) -> tuple[str, ...]:
-        """Return the pucks that did not say, when the arm was closed last, that they are idle; see `Arm`."""
+        """Return in words which pucks did not report at the last closing that they are idle; empty where all did."""
         return self._unconfirmed
 
     def _wait_until_idle(self, bus: PuckBus) -> None:

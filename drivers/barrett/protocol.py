@@ -213,7 +213,7 @@ class Properties:
 
     @staticmethod
     def is_wide(name: str) -> bool:
-        """Return whether values of a property have 32 bits."""
+        """Return whether values of this property have 32 bits, not 16."""
         return name in _WIDE
 
 
@@ -296,7 +296,7 @@ def request_of(data: bytes) -> Request | None:
 
 
 def decoded(frame: Frame) -> Reply | Position | None:
-    """Return what a puck answers with a frame; None for any other frame."""
+    """Decode a puck's frame: its reply to a GET or its position; None for any other frame."""
     if frame.error or frame.remote or frame.extended:
         return None
     address, data = address_of(frame.identifier), frame.data
@@ -397,7 +397,7 @@ class Pendant:
 
 
 def pendant_of(value: int) -> Pendant:
-    """Return what the pendant shows by the safety puck's PEN, a value of 32 bits."""
+    """Decode what the pendant shows, its warnings, faults and lights, from the safety puck's PEN, 32 bits."""
     fields = [(cause, value >> 3 * place & 0b111) for place, cause in enumerate(_CAUSES)]
     return Pendant(
         tuple(cause for cause, bits in fields if bits & _WARNS),
@@ -410,7 +410,7 @@ def pendant_of(value: int) -> Pendant:
 
 
 def pendant_value(pendant: Pendant) -> int:
-    """Return PEN of what a pendant shows; the inverse of `pendant_of`."""
+    """Encode what a pendant shows as the safety puck's PEN; the inverse of `pendant_of`."""
     value = 0
     for place, cause in enumerate(_CAUSES):
         shown = _FAULT if cause in pendant.faults else _WARNS if cause in pendant.warnings else _SAFE

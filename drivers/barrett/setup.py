@@ -100,7 +100,7 @@ class PropertyPort:
         return value
 
     def write(self, node: int, properties: Properties, name: str, value: int, *, verify: bool = True) -> None:
-        """Set a property, leave the puck time, and read it back.
+        """Set a property, wait a moment, and read it back if `verify`; DriverError where it holds another value.
 
         Raises:
             DriverError: it does not answer, or holds another value then.
@@ -111,7 +111,7 @@ class PropertyPort:
             raise DriverError(f"puck {node}: {name} is {found} after {value} was written")
 
     def positions(self, properties: Properties, nodes: Iterable[int]) -> dict[int, int]:
-        """Return the positions [counts] of the pucks that answer one request to the whole arm."""
+        """Request the positions of the whole arm with one frame; return those that come in time [counts], by node."""
         self.link.send(get(Group.ARM, properties.number("P"), group=True))
         wanted, found = set(nodes), dict[int, int]()
         until_ns = self.clock.now_ns() + round(TIMEOUT * 1e9)
@@ -121,7 +121,7 @@ class PropertyPort:
         return found
 
     def pause(self, seconds: float) -> None:
-        """Let time pass [s]."""
+        """Sleep for so many seconds of the link's clock."""
         self.clock.sleep_until_ns(self.clock.now_ns() + round(seconds * 1e9))
 
     def listen(self) -> None:
@@ -176,7 +176,7 @@ class FoundPuck:
 
     @property
     def has_absolute_encoder(self) -> bool:
-        """Return whether MECH is the motor's angle within a turn, whenever power came."""
+        """Return whether MECH is an absolute angle within a motor turn, by the puck's ROLE and firmware version."""
         return bool(self.role & ABSOLUTE_ENCODER) and self.properties.version >= ABSOLUTE_SINCE
 
     def __str__(self) -> str:
@@ -202,12 +202,12 @@ class FoundArm:
 
     @property
     def motors(self) -> Properties:
-        """Return the properties by which all motor pucks are asked at once, those of the first."""
+        """Return the property numbers of the first motor puck, by which all motor pucks are asked at once."""
         return self.pucks[0].properties
 
 
 def found_on(port: PropertyPort, driver: BarrettDriver, *, wakes: bool = True) -> FoundArm:
-    """Ask every puck of an arm for what it reports of itself.
+    """Read version, role and settings of every puck of an arm, after waking those asleep if `wakes`.
 
     Args:
         port: port to the bus.
@@ -263,7 +263,7 @@ def found_on(port: PropertyPort, driver: BarrettDriver, *, wakes: bool = True) -
 
 
 def checks(arm: FoundArm) -> tuple[SetupCheck, ...]:
-    """Compare what the pucks report of themselves with the description."""
+    """Return set-up checks of each puck's firmware, groups, slot and scales against the description."""
     versions = sorted({one.properties.version for one in arm.pucks})
     expected = str(versions[-1]) if len(versions) > 1 else ""
     found = []
@@ -298,7 +298,7 @@ def checks(arm: FoundArm) -> tuple[SetupCheck, ...]:
 
 
 def unreachable(arm: FoundArm) -> list[int]:
-    """Return the nodes that a request to the whole arm, or their torque frame, does not reach."""
+    """Return the nodes of pucks that lack the whole arm's group, or the group of their torque frame."""
     return [
         one.puck.node for one in arm.pucks if not {Group.ARM, one.puck.group} <= {one.values[name] for name in _GROUPS}
     ]
@@ -309,7 +309,7 @@ def _listed(numbers: Sequence[int]) -> str:
 
 
 def limit(port: PropertyPort, arm: FoundArm, driver: BarrettDriver) -> None:
-    """Write the safety puck's limits and their warnings, which revert whenever it loses power.
+    """Write velocity and torque limits and lower warnings to the safety puck, which forgets them without power.
 
     Raises:
         DriverError: it does not answer, or holds other values then.
@@ -321,7 +321,7 @@ def limit(port: PropertyPort, arm: FoundArm, driver: BarrettDriver) -> None:
 
 
 def ignore_jumps(port: PropertyPort, arm: FoundArm) -> None:
-    """Tell the safety puck to ignore some velocity faults, as positions jump from where nobody has asked for them."""
+    """Have the safety puck ignore some velocity faults (IFAULT), since positions jump when they are first asked for."""
     port.write(arm.safety_node, arm.safety, "IFAULT", IGNORED_FAULTS, verify=False)
 
 
@@ -331,7 +331,7 @@ def is_zeroed(port: PropertyPort, arm: FoundArm) -> bool:
 
 
 def lowering(arm: FoundArm) -> tuple[Frame, Frame]:
-    """Return the frames that take the motors, and the safety puck, which may only be lowered, out of torque."""
+    """Return the two frames that take all motor pucks and the safety puck to IDLE."""
     mode = _FIXED.number("MODE")
     return put(Group.ALL, mode, Mode.IDLE, group=True), put(arm.safety_node, mode, SafetyMode.IDLE)
 
@@ -341,16 +341,13 @@ _REST_COUNTS = 8  # of a motor in that time: it stands, or its encoder is betwee
 
 
 def zero(port: PropertyPort, arm: FoundArm, coordinates: Coordinates, home: Sequence[float]) -> tuple[str, ...]:
-    """Define the present position of the arm as its home.
+    """Write the home into the pucks as the position of the resting arm, and return in words what each got.
 
     Args:
         port: port to the bus.
         arm: the pucks' answers; the safety puck must not be ACTIVE.
         coordinates: coordinates of the arm, with counts of 0 where the transmission has its zero.
         home: home position of the joints [rad or m].
-
-    Returns:
-        What was written to each puck, for people.
 
     Raises:
         DriverError: it is active, moves, or a puck does not keep its position. Then nobody counts it as zeroed.

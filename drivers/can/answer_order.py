@@ -40,7 +40,7 @@ class AnswerOrder:
         self._latest_ns = 0
 
     def take(self, delay_ns: int | None) -> int | None:
-        """Take an answer within its cycle.
+        """Count an answer within its cycle; return how many requests ago its own may have been, None if none is open.
 
         Args:
             delay_ns: time since the latest request [ns]; None where it is unknown.
@@ -68,11 +68,11 @@ class AnswerOrder:
         return 0
 
     def take_late(self) -> None:
-        """Take an answer outside of every cycle."""
+        """Count an answer outside of every cycle: one request fewer waits for its answer."""
         self.behind = max(0, self.behind - 1)
 
     def settle(self) -> bool:
-        """Return, at the end of a cycle, whether an uncertain answer counts as the latest request's."""
+        """Return, as a cycle ends, whether an uncertain answer is the latest request's: the first two in a row are."""
         self.uncertain = False
         self._doubted += 1
         return self._doubted <= _BELIEVED
@@ -102,14 +102,11 @@ class AnsweringNode(Protocol):
 
 
 def settle_uncertain(nodes: Iterable[AnsweringNode], tell: Callable[[EventCode, int, str], None]) -> int:
-    """Decide, at the end of a cycle, for which nodes an uncertain answer counts as the latest request's.
+    """Count uncertain answers at the end of a cycle as the latest request's or as late; return how many nodes answered.
 
     Args:
         nodes: of one bus.
         tell: called with the other nodes, whose answers are late.
-
-    Returns:
-        How many nodes have answered by this.
     """
     settled = 0
     for one in nodes:

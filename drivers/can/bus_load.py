@@ -222,7 +222,7 @@ class Line:
 
     @property
     def load(self) -> Cost:
-        """Return the share of the bus that all frames of this sort take."""
+        """Return the share of the bus that all frames of this sort take: unstuffed, typical and worst."""
         return self.each.times(len(self.cob_ids) * self.per_second)
 
 
@@ -242,27 +242,27 @@ class BusLoad:
 
     @property
     def cycle(self) -> Cost:
-        """Return the time on the wire of the frames of one cycle [s], within which the last position has come."""
+        """Return the time on the wire of all frames of one cycle [s]: unstuffed, typical and worst."""
         return sum_of(line.each.times(len(line.cob_ids)) for line in self.lines if line.cyclic)
 
     @property
     def background(self) -> Cost:
-        """Return the share of the bus that does not depend on the rate."""
+        """Return the share of the bus taken by frames that do not depend on the cycle rate."""
         return sum_of(line.load for line in self.lines if not line.cyclic)
 
     @property
     def load(self) -> Cost:
-        """Return the share of the bus taken by all frames."""
+        """Return the share of the bus taken by all frames: unstuffed, typical and worst."""
         return sum_of(line.load for line in self.lines)
 
     @property
     def fits(self) -> bool:
-        """Return whether the bus keeps the rule: at most `MOST_WORST` and `MOST_TYPICAL` of it."""
+        """Return whether the load is at most `MOST_WORST` in the worst case and `MOST_TYPICAL` in the typical one."""
         return self.load.worst <= MOST_WORST and self.load.typical <= MOST_TYPICAL
 
     @property
     def highest_rate(self) -> int:
-        """Return the most whole cycles per second that keep the rule; 0 where the background alone breaks it."""
+        """Return the highest whole cycle rate [Hz] at which the bus `fits`; 0 where the background alone does not."""
         cycle, background = self.cycle, self.background
         most = min((MOST_WORST - background.worst) / cycle.worst, (MOST_TYPICAL - background.typical) / cycle.typical)
         return max(0, floor(most + 1e-9))
@@ -284,12 +284,12 @@ class Budget:
 
     @property
     def fits(self) -> bool:
-        """Return whether every bus keeps the rule."""
+        """Return whether every bus `fits`, by its worst and its typical load."""
         return all(bus.fits for bus in self.buses)
 
     @property
     def highest_rate(self) -> int:
-        """Return the most whole cycles per second that every bus carries."""
+        """Return the highest whole cycle rate [Hz] at which every bus `fits`."""
         return min(bus.highest_rate for bus in self.buses)
 
     @property
@@ -320,7 +320,7 @@ def line_of(
     *,
     cyclic: bool = False,
 ) -> Line:
-    """Return the cost of the frames of one sort.
+    """Return the line of the frames of one sort: identifiers, length, rate, and the mean cost of one on the bus.
 
     Args:
         name: name of the sort of frames.
@@ -357,11 +357,11 @@ def mean_bits(identifier: int, draw: Callable[[random.Random], bytes], *, fd: bo
 
 
 def shares(bus: BusLoad) -> str:
-    """Return the load of a bus in words."""
+    """Return the worst and the typical load of a bus in words [%]."""
     return f"{100 * bus.load.worst:.1f} % worst, {100 * bus.load.typical:.1f} % typical"
 
 
 def sum_of(costs: Iterable[Cost]) -> Cost:
-    """Return the sum of costs; nothing costs nothing."""
+    """Return the sum of costs; zero without any."""
     every = list(costs)
     return Cost(*(sum(column) for column in zip(*every, strict=True))) if every else Cost(0.0, 0.0, 0.0)

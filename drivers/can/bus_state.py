@@ -76,7 +76,7 @@ class BusError(DriverError):
 
 
 def kind_of(code: int | None, otherwise: Kind = "refused") -> Kind:
-    """Return the kind of bus error that an errno means.
+    """Return the kind of bus error that an errno means; `otherwise` for one that means none.
 
     Args:
         code: the errno, None where there is none.
@@ -97,7 +97,7 @@ class BusOffWatch:
         self.off = False
 
     def observe(self, frame: Frame) -> None:
-        """Note an error frame; ignore other frames."""
+        """Update `off` by an error frame: bus-off sets it, a restart clears it; ignore other frames."""
         if frame.error:
             self.off = (self.off or bool(frame.identifier & BUS_OFF)) and not frame.identifier & RESTARTED
 

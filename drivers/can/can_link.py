@@ -51,7 +51,7 @@ class Link(Protocol):
 
 
 def open_links(config: ArmConfig) -> list[Link]:
-    """Open every bus of an arm, in the order of the configuration.
+    """Open every bus of an arm, and return the links in the order of the configuration; all closed on an error.
 
     Args:
         config: the arm's.

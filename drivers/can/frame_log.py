@@ -88,7 +88,7 @@ class BusSession:
         self._log: SessionLog | None = None
 
     def log_frames(self, path: Path) -> None:
-        """Log every frame of the next session to a `.log` of candump's, `.asc` or `.blf`; see `Arm`."""
+        """Have the next session log every frame to this file; DriverError unless it ends in `.log`, `.asc`, `.blf`."""
         self._path = require_format(path)
 
     def logged(self) -> str:
@@ -96,7 +96,7 @@ class BusSession:
         return "" if self._log is None or self._log.report is None else str(self._log.report)
 
     def open(self, *, locks: bool) -> list[Link]:
-        """Lock the buses, unless they are in virtual time, and open their links; whoever gets these closes them.
+        """Lock the buses if `locks`, open their links, logged if asked for, and return them; the caller closes them.
 
         Raises:
             DriverError: a bus is in use or cannot be had, or the log cannot be created; to be closed then, too.
@@ -114,7 +114,7 @@ class BusSession:
         return links
 
     def close(self) -> None:
-        """Let go of the buses and finish the log, which may take its time: last, when everybody is off."""
+        """Release the locks and finish the log, which may take a while: call it last, when the drives are off."""
         for lock in self._locks:
             lock.close()
         self._locks = []
@@ -172,14 +172,14 @@ class SessionLog:
         self.close()
 
     def write(self, bus: int, frames: Sequence[tuple[Frame, bool]]) -> None:
-        """Send frames of one bus, with whether each was sent, to the writing process; never waits."""
+        """Send frames of one bus, each with whether it was sent, to the writing process; drops them if it lags."""
         try:
             self._socket.send(bytes((bus,)) + pack_frames(frames))
         except OSError:
             self.lost += len(frames)
 
     def link(self, link: Link, bus: int = 0, *, fd: bool = False) -> LoggedLink:
-        """Return a link whose frames are logged.
+        """Return a link around this one, by which all frames sent and received are logged.
 
         Args:
             link: link of the bus; closed with the returned link.
@@ -249,7 +249,7 @@ class LoggedLink:
         return frames
 
     def close(self) -> None:
-        """Close the link; its last frames are written."""
+        """Send the last frames to the log and close the link."""
         self._flush()
         self._link.close()
 

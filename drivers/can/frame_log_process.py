@@ -37,7 +37,7 @@ class CandumpWriter(CanutilsLogWriter):
     """Write candump logs like python-can, but with the details of error frames, as `candump -L` writes them."""
 
     def on_message_received(self, msg: can.Message) -> None:
-        """Write one frame."""
+        """Write one frame to the file, an error frame with its details."""
         if msg.is_error_frame:
             word, data = msg.arbitration_id | ERROR, bytes(msg.data).hex().upper()
             self.file.write(f"({msg.timestamp:f}) can{msg.channel} {word:08X}#{data}\n")
@@ -107,7 +107,7 @@ class OrderedLog:
 
 
 def main() -> int:
-    """Write one log; returns 0 when it is complete."""
+    """Write one log of the frame packets on standard input; return 0 when it is complete."""
     _step_back()
     with socket.socket(fileno=sys.stdin.fileno()) as source:
         return _serve(source)

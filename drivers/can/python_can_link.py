@@ -33,7 +33,7 @@ _PLAUSIBLE_S = 1.0
 
 
 def from_config(config: ArmConfig, bus_number: int) -> PythonCanLink:
-    """Open the link of one bus of an arm; entry point `python_can`.
+    """Open and return the link of one bus of an arm; entry point `python_can`.
 
     Raises:
         BusError: no such interface, it is down or without the CAN FD asked for, or it cannot be opened.
@@ -119,7 +119,7 @@ class PythonCanLink:
         self._closed = False
 
     def send(self, frame: Frame) -> None:
-        """Hand one frame to the interface; returns at once.
+        """Hand one frame to the interface and return at once; BusError where it is off, gone or full.
 
         Raises:
             BusError: bus-off, interface down or gone, queue full.
@@ -170,7 +170,7 @@ class PythonCanLink:
         return frames
 
     def hear(self, frame: Frame) -> None:
-        """Let a frame be the next to be received: what the kernel tells of the controller beside the socket."""
+        """Queue a frame of the controller's state, stamped now, to be returned by a later `receive` or `drain`."""
         self._watch.observe(frame)
         self._waiting.append(frame._replace(stamp_ns=time.monotonic_ns()))
 

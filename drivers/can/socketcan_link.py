@@ -54,7 +54,7 @@ _REQUEST, _LONGEST_NAME = struct.Struct("16si20x"), 15  # struct ifreq, IFNAMSIZ
 
 
 def check_interface(bus: CanBus) -> None:
-    """Refuse an interface whose defect would show late: python-can would leave a socket open, CAN FD fail in a cycle.
+    """Raise BusError where the interface is missing, or CAN FD is configured that it is not set up for.
 
     Where the kernel has no CAN sockets nothing is refused; opening says so.
 
@@ -87,7 +87,7 @@ _STATES = {
 
 
 def controller_state_frame(channel: str) -> Frame | None:
-    """Return the error frame that tells the present state of an interface's controller, None where all is well.
+    """Return an error frame if an interface's controller is error-passive or bus-off, None for any other state.
 
     Args:
         channel: name of the interface.
@@ -108,7 +108,7 @@ def controller_state_frame(channel: str) -> Frame | None:
 
 
 def state_in_link_message(message: bytes) -> Frame | None:
-    """Return the error frame for the state of a controller in an answer of rtnetlink; see `controller_state_frame`."""
+    """Return the error frame for the controller's state in an rtnetlink answer; None for a good or unknown state."""
     if len(message) < _HEADER.size or _HEADER.unpack_from(message)[1] != _NEW_LINK:
         return None
     found = message[_HEADER.size + _LINK.size :]
@@ -148,7 +148,7 @@ _PLAUSIBLE_NS = 10_000_000_000  # a stamp older than this, or in the future, com
 
 
 def from_config(config: ArmConfig, bus_number: int) -> RawLink:
-    """Open the link of one bus of an arm; entry point `raw`.
+    """Open and return the link of one bus of an arm; entry point `raw`.
 
     Raises:
         BusError: the interface is missing, down, or without the CAN FD asked for, or this kernel has no CAN sockets.
@@ -226,7 +226,7 @@ class RawLink:
         self._dropped = 0
 
     def send(self, frame: Frame) -> None:
-        """Hand one frame to the kernel's queue.
+        """Hand one frame to the kernel's queue and return at once; BusError where the bus is off, gone or full.
 
         Raises:
             BusError: bus-off, interface down or gone, queue full.
@@ -273,7 +273,7 @@ class RawLink:
         return frames
 
     def hear(self, frame: Frame) -> None:
-        """Let a frame be the next to be received: what the kernel tells of the controller beside the socket."""
+        """Queue a frame of the controller's state, stamped now, to be returned by a later `receive` or `drain`."""
         self._watch.observe(frame)
         self._waiting.append(frame._replace(stamp_ns=time.monotonic_ns()))
 

@@ -53,7 +53,7 @@ _VALUES: dict[Entry, Callable[[random.Random], int]] = {
 
 
 def budget(driver: CanopenDriver, rate: float) -> Budget:
-    """Compute the bus loads of an arm's frames at a rate.
+    """Return the loads of an arm's frames on its buses at a rate [Hz], with remedies where one does not fit.
 
     Args:
         driver: the arm's section `driver`.
@@ -72,7 +72,7 @@ def frame_line(
     *,
     cyclic: bool = False,
 ) -> Line:
-    """Return the cost of frames with these contents on a bus; `slots` decide length and typical values."""
+    """Return the line of frames with these contents: their cost on a bus; `slots` decide length and typical values."""
     length, fd = sum(slot.kind.size for slot in slots), bus.data_bitrate is not None
     return line_of(name, cob_ids, length, per_second, bus, lambda one: _mean_bits(one, slots, fd), cyclic=cyclic)
 

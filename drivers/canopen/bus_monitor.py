@@ -55,7 +55,7 @@ class BusListener:
         self.streaming: set[int] = set()
 
     def take(self, bus: int, frame: Frame) -> None:
-        """Process one received frame of any kind."""
+        """Note what a received frame tells: SYNC on its bus, a node's NMT state or boot-up, or that it answers SDO."""
         if frame.error or frame.remote or frame.extended:
             return
         node = frame.identifier - HEARTBEAT
@@ -73,20 +73,20 @@ class BusListener:
             self.answered.add((bus, frame.identifier - SDO_REPLY))
 
     def listen(self, links: Sequence[Link], period: float) -> None:
-        """Listen long enough for every heartbeat of this period [s]; raises DriverError when a bus is gone."""
+        """Take frames on every bus for somewhat longer than a heartbeat period [s]; DriverError when a bus is gone."""
         until_ns = links[0].clock.now_ns() + round(LONGER * period * 1e9)
         for bus, link in enumerate(links):
             while (frame := link.receive(until_ns)) is not None:
                 self.take(bus, frame)
 
     def drain(self, links: Sequence[Link]) -> None:
-        """Process the frames that wait; raises DriverError when a bus is gone."""
+        """Take the frames that wait on every bus, without waiting; raises DriverError when a bus is gone."""
         for bus, link in enumerate(links):
             for frame in link.drain():
                 self.take(bus, frame)
 
     def nmt_words(self, place: Place, now_ns: int, patience_ns: int) -> str:
-        """Describe a node's NMT state for people, as of now.
+        """Describe a node's NMT state as heard last, and whether its heartbeat is missing by now, in words.
 
         Args:
             place: bus and node number.
@@ -122,7 +122,7 @@ class _LastAnswers:
 
 
 def look_rate(driver: CanopenDriver) -> float:
-    """Return how often all drives can be asked [Hz]: `RATE`, or the rate that takes `SHARE` of the fullest bus."""
+    """Return the rate at which all drives are asked [Hz]: `RATE`, or less where that takes `SHARE` of a bus."""
     frames = 2 * len(_QUESTIONS) * sum(worst(_SDO_BYTES))
     loads = [
         frames * sum(drive.bus == number for drive in driver.drives) / bus.bitrate
@@ -216,7 +216,7 @@ class MonitoringArm(Arm):
         raise DriverError("a read-only arm cannot be reset")
 
     def exchange(self, torque: Vector | None) -> Sample:
-        """Ask every drive once for its position, status and errors.
+        """Ask every drive once by SDO for its position, status and errors, and return the sample; takes no torque.
 
         Raises:
             DriverError: not open, a torque, a bus is gone, or another host has begun to stream: it must not be delayed.

@@ -68,12 +68,12 @@ class FoundNode:
 
     @property
     def is_drive(self) -> bool:
-        """Return whether the node says that it is a drive of CiA 402."""
+        """Return whether the node says by its device type (1000h) that it is a drive of CiA 402."""
         return self.device_type is not None and self.device_type & 0xFFFF == DRIVE_PROFILE
 
 
 def scan(config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_links) -> list[FoundNode]:
-    """Return every node that sends heartbeats or answers, by bus and node number.
+    """Listen on an arm's buses, ask every node number by SDO, and return the nodes found, by bus and number.
 
     Args:
         config: configuration with a CANopen driver.
@@ -90,7 +90,7 @@ def scan(config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_l
 def asking(
     config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_links
 ) -> Iterator[tuple[CanopenDriver, list[Link], BusListener]]:
-    """Open the buses of an arm exclusively, to ask nodes on them, after a second of listening for heartbeats.
+    """Open the buses of an arm exclusively, listen for a second, and yield driver section, links and listener.
 
     Args:
         config: configuration with a CANopen driver.
@@ -149,7 +149,7 @@ def _found(driver: CanopenDriver, links: list[Link], listener: BusListener) -> l
 
 
 def hearing(listener: BusListener, bus: int) -> Callable[[Frame], None]:
-    """Return the function that takes the frames of a bus that are not answers."""
+    """Return a function that passes the frames of this bus to the listener."""
     return lambda frame: listener.take(bus, frame)
 
 

@@ -41,7 +41,7 @@ def shipped_families() -> tuple[Family, ...]:
 
 
 def family_of(identity: Mapping[str, int], own: Sequence[Family] = ()) -> Family:
-    """Return the family of a drive, with what it leaves open as in `generic402`.
+    """Return the family of a drive by vendor and product, or the generic one, which also fills what it leaves open.
 
     Args:
         identity: values of 1018h, by the keys `vendor` and `product`.
@@ -56,7 +56,7 @@ def family_of(identity: Mapping[str, int], own: Sequence[Family] = ()) -> Family
 
 
 def parse_entry(text: str, name: str, unit: str = "") -> Entry:
-    """Return an entry that a family names, such as `6071:0/i16`."""
+    """Parse an entry as a family writes it, index:sub/type, such as `6071:0/i16`."""
     where, kind = text.split("/")
     index, sub = where.split(":")
     return Entry(int(index, 16), int(sub, 16), Kind[kind.upper()], name, unit)
@@ -125,16 +125,16 @@ class DriveEntries:
     firmware: str = ""
 
     def has(self, entry: Entry) -> bool:
-        """Tell whether the drive has an entry."""
+        """Return whether the drive is known to have an entry."""
         return entry.key in self.there
 
     def get(self, entry: Entry) -> int | None:
-        """Return what an entry holds; None where that is not known."""
+        """Return the value that an entry is known to hold; None where none is known."""
         return self.values.get(entry.key)
 
     @property
     def identity(self) -> dict[str, int]:
-        """Return vendor and product (1018h), as far as they are known."""
+        """Return a dict of `vendor` and `product` (1018h), each only where it is known."""
         said = {"vendor": self.get(od.VENDOR), "product": self.get(od.PRODUCT)}
         return {name: value for name, value in said.items() if value is not None}
 
@@ -192,7 +192,7 @@ class Capabilities:
 
     @property
     def summary(self) -> str:
-        """Describe what a preflight ticket is for: mode, size of a count, limits, watchdogs, status reports."""
+        """Describe in one line the drive's family, torque mode, count, limits, watchdogs and status reports."""
         unknown = "unknown"
         torque = unknown if self.torque is None else f"mode {self.torque.mode} by {named(self.torque.target)}"
         count = unknown if self.count is None else f"{self.count:.6g} N m"
@@ -207,14 +207,14 @@ class Capabilities:
         )
 
     def require(self, node: int) -> None:
-        """Raise UnsuitableDrive where the drive is to be refused, with everything that is wrong."""
+        """Raise UnsuitableDrive, with everything that is wrong, where the drive or its description has a problem."""
         if wrong := (*self.problems, *self.changes):
             told = "; ".join(map(str, wrong))
             raise UnsuitableDrive(f"node {node}: cannot be driven ({self.family.name}): {told}")
 
 
 def capabilities(objects: Objects, driver: CanopenDriver, number: int) -> Capabilities:
-    """Ask a drive of an arm, by uploads alone, for its capabilities, and judge them.
+    """Read a drive's entries by SDO uploads alone; return what it can do, and its problems.
 
     Args:
         objects: of the drive.
@@ -230,14 +230,14 @@ def capabilities(objects: Objects, driver: CanopenDriver, number: int) -> Capabi
 
 
 def required(objects: Objects, driver: CanopenDriver, number: int) -> Capabilities:
-    """Ask as `capabilities` does; raises DriverError also for a drive that cannot be driven, with everything wrong."""
+    """Return `capabilities` of a drive; raises UnsuitableDrive, with everything wrong, if it cannot be driven."""
     can = capabilities(objects, driver, number)
     can.require(objects.node)
     return can
 
 
 def discovered(objects: Objects, drive: CanopenDrive, own: Sequence[Family] = ()) -> tuple[Family, DriveEntries]:
-    """Ask a drive for all entries that matter, by uploads alone.
+    """Read all entries that matter from a drive by SDO uploads; return its family and these entries.
 
     Args:
         objects: of the drive.
@@ -265,7 +265,7 @@ def _firmware(objects: Objects) -> str:
 def entries_from_sheet(
     sheet: DataSheet, drive: CanopenDrive, own: Sequence[Family] = ()
 ) -> tuple[Family, DriveEntries]:
-    """Return a drive's entries from its data sheet instead of the drive; arguments as for `discovered`."""
+    """Return a drive's family and entries from its data sheet, without asking it; arguments as for `discovered`."""
     told = {0x101800 | sub: value for sub, value in sheet.identity.items()}
     family = family_of(DriveEntries(frozenset(), told).identity, own)
     values = {key: value for key, one in sheet.entries.items() if (value := one.number(drive.node)) is not None}
@@ -308,7 +308,7 @@ def _read_entries(objects: Objects, entries: Mapping[int, Entry] | Sequence[Entr
 def assess(
     found: DriveEntries, family: Family, drive: CanopenDrive, driver: CanopenDriver, sheet: DataSheet | None
 ) -> Capabilities:
-    """Compare what a drive has with what it needs.
+    """Compare the entries that a drive has with what is needed; return its capabilities with all problems.
 
     Args:
         found: entries that the drive has.
@@ -399,7 +399,7 @@ def where(entry: Entry) -> str:
 
 
 def named(text: str) -> str:
-    """Return an entry of a family, given as text, as people write it."""
+    """Rewrite a family's entry, such as `6410:2/u32`, as people write it: `6410h:02`."""
     return where(parse_entry(text, ""))
 
 
@@ -437,7 +437,7 @@ def _frame_changes(path: TorquePath | PositionPath, drive: CanopenDrive) -> Iter
 
 
 def speed_size(entry: Entry, unit: int | None, drive: CanopenDrive) -> float | None:
-    """Return how many of an entry's unit a turn per minute is; None where nobody knows.
+    """Return how many units of a speed entry one turn per minute is; None where nobody knows.
 
     Args:
         entry: entry of the largest speed; the largest profile velocity (607Fh) is in the unit of velocities, by CiA
@@ -484,7 +484,7 @@ def _count(family: Family, found: DriveEntries, drive: CanopenDrive) -> float | 
 
 
 def torque_unit(unit: TorqueUnit, drive: CanopenDrive) -> float:
-    """Return what one unit of a torque is [N m]; what a description does not say counts as 1."""
+    """Return the size of one unit of a torque [N m]; factors that the description lacks count as 1."""
     constant = drive.torque_constant or 1.0 if unit.of_current else 1.0
     return TORQUE_UNITS[unit.unit] * constant * (drive.current_unit or 1.0 if unit.unit == "own" else 1.0)
 

@@ -63,7 +63,7 @@ _AT_SYNC = (1, 0, 255)  # types of frames of targets, in the order in which they
 
 
 def configure_pdos(objects: Objects, pdos: Sequence[Pdo], unused: Sequence[Pdo], dummies: Sequence[int]) -> bool:
-    """Configure a pre-operational drive's PDOs.
+    """Configure a pre-operational drive's PDOs; return whether targets act on arrival instead of at a SYNC.
 
     Args:
         objects: of the drive.
@@ -244,13 +244,13 @@ class DriveConfiguration:
 
     @property
     def torque(self) -> TorquePath | PositionPath:
-        """Return how torques, or positions, are streamed to the drive."""
+        """Return the path, mode and target entry, by which torques or positions are streamed to the drive."""
         assert self.can.torque is not None  # noqa: S101 - else it has been refused
         return self.can.torque
 
     @property
     def limit_counts(self) -> int:
-        """Return the largest torque [per mille of rated torque].
+        """Return the largest torque that the drive may give [per mille of rated torque].
 
         Where positions are streamed the drive alone can keep the joints' limits; else the host does, cycle by cycle.
         """
@@ -263,13 +263,13 @@ class DriveConfiguration:
         return isinstance(self.can.torque, PositionPath)
 
     def watchdog(self) -> list[Write]:
-        """Return the downloads that set a watchdog of the maker's."""
+        """Return the downloads that set the watchdog of the drive's maker; empty where none is described."""
         if (own := self.drive.watchdog_entry) is None:
             return []
         return [Write(Entry(own.index, own.sub, Kind[own.type.upper()], "watchdog of the drive's maker"), own.value)]
 
     def options(self) -> list[Write]:
-        """Return the downloads of the reactions, for drives that let them be chosen."""
+        """Return the downloads of the drive's reactions to quick stop, fault and loss of connection."""
         return [
             Write(od.QUICK_STOP_OPTION, self.quick_stop),
             Write(od.FAULT_OPTION, self.reactions.fault),
@@ -277,7 +277,7 @@ class DriveConfiguration:
         ]
 
     def hints(self) -> list[Write]:
-        """Return the downloads of what drives want to know: the cycle and, in torque mode, the position limits.
+        """Return optional downloads: the cycle's period and, in torque mode, position limits and interpolation.
 
         They protect nothing: drives in torque mode give torque beyond the position limits.
         """
@@ -285,7 +285,7 @@ class DriveConfiguration:
         return todo if self.positions else [*todo, *self.position_limits(), *self.interpolation()]
 
     def position_limits(self) -> list[Write]:
-        """Return the downloads of the position limits."""
+        """Return the downloads of the position limits; empty for a motor without any."""
         if self.motor.positions is None:
             return []
         lowest, highest = self.motor.positions
@@ -315,7 +315,7 @@ class DriveConfiguration:
 
 
 def motor_limits(config: ArmConfig, found: Coordinates) -> list[MotorLimits]:
-    """Convert the limits of an arm's joints to each of its motors.
+    """Return each motor's limits of position, speed, deceleration and torque, converted from the joints'.
 
     Args:
         config: configuration with a CANopen driver and a transmission.
@@ -340,7 +340,7 @@ def watchdogs_of(driver: CanopenDriver, names: Sequence[str]) -> tuple[Watchdog,
 
 
 def differences(found: Mapping[str, int], wanted: DriveIdentity) -> list[str]:
-    """Describe how an identity (1018h), by the keys of `IDENTITY`, differs from the configured one; else empty."""
+    """Describe each value of an identity (1018h) that is missing or not the configured one; empty if all agree."""
     return [
         f"{name} is {found[name]:08X}h instead of {value:08X}h" if name in found else f"{name} is not told"
         for name, value in wanted.model_dump(exclude_none=True).items()
@@ -349,7 +349,7 @@ def differences(found: Mapping[str, int], wanted: DriveIdentity) -> list[str]:
 
 
 def quick_stop_option(config: ArmConfig) -> int:
-    """Return the value for 605Ah: as described, else to stay in quick stop where the arm has no brakes."""
+    """Return the value for 605Ah: as described, else to stay in quick stop if `after_stop` is hold or lower."""
     assert isinstance(config.driver, CanopenDriver)  # noqa: S101 - of an arm of CANopen drives
     described = config.driver.reactions.quick_stop
     if described is not None:
@@ -358,7 +358,7 @@ def quick_stop_option(config: ArmConfig) -> int:
 
 
 def identify(objects: Objects, wanted: DriveIdentity) -> str:
-    """Read the identity of a drive and compare it with the wanted one.
+    """Read a drive's identity and return it in words; raises DriverError where it is not the wanted one.
 
     Returns:
         `node 3: vendor 0000019Eh, product ..., revision ..., serial ..., firmware ...`.
@@ -402,7 +402,7 @@ def is_error_passive(objects: Objects) -> bool:
 
 
 def configure(objects: Objects, setup: DriveConfiguration) -> OperationMode:
-    """Configure a pre-operational drive for the profile and its own protection; what it has already is not written.
+    """Configure a pre-operational drive, writing only what differs; return its mode of operation.
 
     Returns:
         The mode of operation, which is sent with every control word.
@@ -499,7 +499,7 @@ class LeftDrive:
 
 
 def disable_supervision(objects: Objects, zeros: Zeros | None, number: int, restarted: Callable[[], bool]) -> LeftDrive:
-    """Disable the supervision of the host in a drive that is off; a drive that is on keeps it.
+    """Disable a drive's supervision of its host if it is off; return its state, and whether it may still react.
 
     A zero that the drive has confirmed it confirms afterwards too, and nothing else: one that restarted in the session
     has lost its zero. A part that it refuses does not keep it from the others.
@@ -538,16 +538,13 @@ def disable_supervision(objects: Objects, zeros: Zeros | None, number: int, rest
 
 
 def reset_farewell_fault(objects: Objects, blames: Callable[[], bool]) -> DriveState:
-    """Reset the fault with which a pre-operational drive has answered that its host left it, if it did.
+    """Reset a fault that a drive has because its host left it; return the state in which it is at last.
 
     No next session could enable the drive, and closing the one that resets it would leave the fault behind again.
 
     Args:
         objects: of a drive that was off, without a fault, before it was left.
         blames: whether the drive gives another reason for a fault, which then stays.
-
-    Returns:
-        The state in which the drive is at last.
 
     Raises:
         DriverError: it does not answer, or refuses control words.

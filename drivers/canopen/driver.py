@@ -124,7 +124,7 @@ class StopCommand:
                 self._untold.append(number)
 
     def counts(self, zero: Sequence[int]) -> Sequence[int] | None:
-        """Return the torques to send: zero, or None for no torque frames before all drives were told to stop.
+        """Return `zero`, or None for no torque frames while a drive has not been told to stop.
 
         Drives that get zero torque, but not yet the stop, would let an arm fall that they or their brakes are to hold.
 
@@ -187,7 +187,7 @@ class MeasuredTorque:
         self.difference: Vector | None = None
 
     def cycle(self, counts: Sequence[int], drives: Sequence[Drive]) -> None:
-        """Process the torques sent and the reports received in a cycle.
+        """Update measured torque and its difference from the torques sent and the reports received in a cycle.
 
         Args:
             counts: sent with its SYNC [per mille of rated torque], by drive.
@@ -226,7 +226,7 @@ _CODES = BUS_EVENTS | {
 
 
 def axis_events(events: Iterable[Event], codec: BusCodec, joint_of: Mapping[int, int]) -> list[AxisEvent]:
-    """Translate the events of one bus.
+    """Translate the events of one bus to joints' events; states, reset errors and returns to normal are left out.
 
     Args:
         events: events of the codec. Those of drive states, reset errors and returns to normal are left out.
@@ -259,11 +259,11 @@ class Reports:
         self._missed = MissedReports()
 
     def forget_missing(self) -> None:
-        """Report missing reports once more: nobody may have acted on what was said while the arm was idle."""
+        """Forget which missing reports were told, so that those still missing are reported once more."""
         self._missed = MissedReports()
 
     def new(self, codecs: Iterable[BusCodec], cycle: int, now_ns: int) -> list[AxisEvent]:
-        """Return the events since the last call; `cycle` is the cycle's number, `now_ns` of the links' clock [ns]."""
+        """Return the joints' events since the last call and, in every n-th cycle, reports that have gone missing."""
         found: list[AxisEvent] = []
         look = cycle % self._look_every == 0
         for codec in codecs:
@@ -281,7 +281,7 @@ class MissedReports:
         self._told: set[tuple[int, int, AxisEventCode]] = set()
 
     def new(self, codec: BusCodec, now_ns: int, joint_of: Mapping[int, int]) -> list[AxisEvent]:
-        """Return the reports that have gone missing on one bus since the last call.
+        """Return an event for each drive of one bus whose heartbeat or status report has newly gone missing.
 
         Args:
             codec: of the bus.
@@ -363,18 +363,18 @@ class CanopenArm(Arm):
         self._boots = [0] * len(self._driver.drives)  # of each drive, when its configuration began
 
     def look(self) -> Arm:
-        """Return an arm that reads the drives' objects by SDO and sends nothing else."""
+        """Return a closed arm on the same buses that reads the drives' objects by SDO and sends nothing else."""
         return MonitoringArm(self._config, self._open_bus)
 
     def zero(self) -> tuple[str, ...]:
-        """Store the drives' present position as the home of the description; see `Arm`."""
+        """Store the present position in the drives of the closed arm as its home; return in words what each reports."""
         if self._buses is not None:
             raise DriverError("the arm is open; close it before it is zeroed")
         with ZeroingArm(self._config, self._open_bus) as arm:
             return arm.set_home()
 
     def log_frames(self, path: Path) -> None:
-        """Log every frame of the next session; see `Arm`."""
+        """Have the next session log every frame to a new file; DriverError where its suffix names no format."""
         self._session.log_frames(path)
 
     def logged(self) -> str:
@@ -431,11 +431,11 @@ class CanopenArm(Arm):
         )
 
     def bus_budget(self, rate: float | None = None) -> Budget:
-        """Return the load of the buses, see `Arm`."""
+        """Return the load of the buses at `rate` [Hz], by default the configured one; with remedies if too much."""
         return budget(self._driver, self._config.control.rate if rate is None else rate)
 
     def setup_checks(self) -> tuple[SetupCheck, ...]:
-        """Return a check of each controller of the host that is error-passive or bus-off, see `Arm`."""
+        """Return a failed check of each controller of the host that is error-passive or bus-off; else empty."""
         codecs = self._open().codecs
         return tuple(one for codec in codecs for one in controller_checks(codec.profile.bus.channel, codec.controller))
 
@@ -482,7 +482,7 @@ class CanopenArm(Arm):
         )
 
     def exchange(self, torque: Vector | None) -> Sample:
-        """Exchange one cycle; see `Arm`.
+        """Exchange one cycle, with a torque clipped to its limits or none; return the sample.
 
         Raises:
             DriverError: as in the contract.
@@ -502,7 +502,7 @@ class CanopenArm(Arm):
         return self._exchanged(buses, sends=torque is not None)
 
     def exchange_position(self, position: Vector) -> Sample:
-        """Exchange one cycle with drives that are given positions; see `Arm`.
+        """Exchange one cycle with drives that are given positions, which are sent in counts; return the sample.
 
         Raises:
             DriverError: as in the contract.
@@ -531,15 +531,15 @@ class CanopenArm(Arm):
         return sample
 
     def watchdogs(self) -> tuple[Watchdog, ...]:
-        """Return the watchdog of each drive, see `Arm`."""
+        """Return the watchdog of each drive: its signal and its time."""
         return watchdogs_of(self._driver, self._names)
 
     def withhold(self, kind: str) -> None:
-        """Stop sending what watchdogs of one kind watch, see `Arm`."""
+        """Stop sending what watchdogs of one kind watch, until the next `stop`, so that they act."""
         self._open().withheld.add(kind)
 
     def drive_status(self) -> tuple[AxisStatus, ...]:
-        """Return the last reported status of each drive, see `Arm`."""
+        """Return the last reported status of each drive in flags common to all fieldbuses."""
         return tuple(drive.axis_status for drive in self._open().drives)
 
     def stop(self, kind: StopKind) -> None:
@@ -555,7 +555,7 @@ class CanopenArm(Arm):
             self._stop.give(self._buses, kind)
 
     def close(self) -> None:
-        """Take torque off, restore the drives' power-up settings and close the buses; any number of times.
+        """Stop the drives, end their supervision of the host and close the buses; any number of times.
 
         A quick stop is not cut short by it: drives that are told to let go in the midst of one would let the arm fall.
         The same holds for drives that were found holding the arm in quick stop, unless they have been told to let go.
@@ -571,7 +571,7 @@ class CanopenArm(Arm):
         self._session.close()
 
     def unconfirmed(self) -> tuple[str, ...]:
-        """Return the drives that did not confirm, when the arm was closed last, that they are off; see `Arm`."""
+        """Return in words which drives did not confirm at the last closing that they are off; empty if all did."""
         return tuple(self._unconfirmed)
 
     def _leave(self, buses: Buses) -> None:

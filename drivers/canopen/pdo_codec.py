@@ -137,7 +137,7 @@ class Drive:
 
     @property
     def axis_status(self) -> AxisStatus:
-        """Return the status in flags common to all fieldbuses; none before the first status word."""
+        """Return the status in flags common to all fieldbuses; no flag before the first status word."""
         error = 0 if self.emergency is None else self.emergency.code
         status = self.status if self.let_go is None else self.let_go
         return AxisStatus(0) if status is None else axis_status(status, error)
@@ -276,7 +276,7 @@ class BusCodec:
         return Frame(NMT, bytes([command, node]))
 
     def begin_cycle(self, now_ns: int = 0, *, asks: bool = True) -> None:
-        """Open a cycle after SYNC has been sent: from now on each drive may answer once.
+        """Begin a cycle after SYNC was sent: each drive may answer once, and its data is a cycle older.
 
         Args:
             now_ns: time of SYNC [ns of the link's clock], for frames without a stamp.
@@ -290,7 +290,7 @@ class BusCodec:
             drive.order.behind += asks
 
     def end_cycle(self) -> None:
-        """Close the cycle at its deadline: answers from now on are late."""
+        """End the cycle at its deadline: uncertain answers are decided on, and answers from now on are late."""
         self._open = False
         if self._missing:
             self._missing -= settle_uncertain(self.drives, self._tell)
@@ -317,7 +317,7 @@ class BusCodec:
         return taken
 
     def forget_events(self) -> None:
-        """Discard the events so far, expected or reported otherwise; what still ails the bus is reported anew."""
+        """Discard all events so far, so that conditions that persist are reported again."""
         self._events = []
         self._strangers.clear()
         self._foreign.clear()
@@ -332,7 +332,7 @@ class BusCodec:
                 self._tell(EventCode.EMERGENCY, drive.node, f"{words}, and not over yet")
 
     def receive(self, frame: Frame) -> None:
-        """Take one frame, whatever it is; never raises."""
+        """Take one received frame, whatever it is, into the drives' states and the events; never raises."""
         if frame.error:
             self._on_error(frame)
             return

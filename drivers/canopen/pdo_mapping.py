@@ -43,7 +43,7 @@ class Write:
     ignored: int = 0
 
     def same(self, held: int) -> bool:
-        """Return whether a value is as good as this one."""
+        """Return whether a value that an entry holds is this one, but for the ignored bits."""
         return not (held ^ self.value) & ~self.ignored
 
     @property
@@ -191,12 +191,12 @@ class BusProfile:
     heartbeat_wait: float | None = None
 
     def watchdog(self, node: int) -> WatchdogKind:
-        """Return the signal that a drive's watchdog watches."""
+        """Return the kind of signal that a drive's watchdog watches."""
         return self.watchdogs[self.nodes.index(node)] if self.watchdogs else "rpdo_timer"
 
     @property
     def guarded(self) -> tuple[int, ...]:
-        """Return the nodes of the drives that are guarded."""
+        """Return the nodes of the drives whose watchdog is node guarding."""
         return tuple(node for node in self.nodes if self.watchdog(node) == "node_guarding")
 
     @property
@@ -240,7 +240,7 @@ class BusProfile:
 
     @property
     def status_syncs(self) -> int:
-        """Return the SYNCs from one status report to the next, of drives without a timer for it (1801h:05)."""
+        """Return the number of SYNCs between status reports of drives without a timer for them (1801h:05)."""
         return min(max(1, round(self.status_inhibit * self.rate)), _MOST_SYNCS)
 
     def host_supervision(self, node: int) -> list[Write]:
@@ -256,7 +256,7 @@ class BusProfile:
         return todo
 
     def silenced(self, node: int) -> list[Pdo]:
-        """Return the PDOs that this profile does not use, with the COB-IDs that they have by default."""
+        """Return the PDOs that this profile does not use, to be switched off, with their default COB-IDs."""
         return [
             Pdo(number, sent, (TPDO1 if sent else RPDO1) + (number - 1) * 0x100 + node, _ON_RECEPTION, ())
             for sent, number in (*(() if self.status_slots else ((True, 2),)), *_UNUSED)

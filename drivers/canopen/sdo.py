@@ -51,7 +51,7 @@ class WriteNotVerified(DriverError):
 
 
 def optional(do: Callable[[Any], T], what: Any) -> T | None:
-    """Return the result of an action on an entry; None where the drive has no such entry."""
+    """Return `do(what)`; None where it raises SdoRefused because the drive has no such entry."""
     try:
         return do(what)
     except SdoRefused as refused:
@@ -117,7 +117,7 @@ class Objects:
             self._others(frame)
 
     def discard_answers(self) -> None:
-        """Pass over answers to earlier requests, for as long as one may take to come; raises DriverError."""
+        """Discard answers to earlier requests for as long as one may take to come; DriverError when the bus is gone."""
         deadline = self._link.clock.now_ns() + round(self.patience * 1e9)
         while (frame := self._link.receive(deadline)) is not None:
             self._others(frame)
@@ -140,7 +140,7 @@ class Objects:
             raise DriverError(f"node {self.node}: {error}") from None
 
     def write(self, write: Write) -> None:
-        """Set an entry; raises as `read_bytes`."""
+        """Set an entry without reading it back; raises as `read_bytes`."""
         entry = write.entry
         what = f"setting {entry} to {write.value}"
         self._request(what, self._client.download, entry.index, entry.sub, write.data)
@@ -155,17 +155,17 @@ class Objects:
             return False
 
     def ensure(self, write: Write) -> None:
-        """Compare an entry with a value, write it where it differs, and read it back; raises as `set`."""
+        """Write an entry where it differs from a value, and read it back; raises as `set`, also without the entry."""
         if not optional(self.holds, write):  # setting a missing entry raises the error
             self.set(write)
 
     def write_if_present(self, write: Write) -> None:
-        """Do what `ensure` does, and nothing where the drive has no such entry."""
+        """Write an entry where it holds another value, and read it back; do nothing where the drive has none."""
         if optional(self.holds, write) is False:
             self.set(write)
 
     def set(self, write: Write) -> None:
-        """Set an entry and read it back; raises as `read`, and NotHeld when it holds something else."""
+        """Set an entry and read it back; raises as `read`, and WriteNotVerified when it holds something else."""
         self.write(write)
         held = self.read(write.entry)
         if not write.same(held):
@@ -215,12 +215,12 @@ class DryRunObjects(Objects):
         self._written: dict[int, int] = {}
 
     def read(self, entry: Entry) -> int:
-        """Return what an entry would hold; raises as `Objects.read`."""
+        """Return what an entry would hold: the value noted last, else the node's own; raises as `Objects.read`."""
         written = self._written.get(entry.key)
         return super().read(entry) if written is None else written
 
     def write(self, write: Write) -> None:
-        """Note a change; raises as `Objects.read` where the node has no such entry."""
+        """Note a change instead of writing it; SdoRefused where the node has no such entry, or it is fixed."""
         try:
             before: int | None = self.read(write.entry)
         except SdoRefused as refused:
@@ -241,7 +241,7 @@ _ABORT_FRAME, _UPLOAD, _EXPEDITED, _SIZED = 0x80, 0x40, 0x02, 0x01
 
 
 def upload_request(entry: Entry) -> bytes:
-    """Return the eight bytes that ask for an entry."""
+    """Return the eight bytes of the SDO request to upload an entry."""
     return struct.pack("<BHB4x", _UPLOAD, entry.index, entry.sub)
 
 
@@ -258,7 +258,7 @@ class Answers:
     aborts: dict[Place, int] = field(default_factory=dict)
 
     def take(self, place: Place, entry: Entry, data: bytes) -> bool:
-        """Store eight bytes of a node if they are its answer; returns whether they are."""
+        """Store eight SDO bytes of a node, as value or abort, if they answer for this entry; return whether they do."""
         first, index, sub = struct.unpack_from("<BHB", data)
         if (index, sub) != (entry.index, entry.sub):
             return False
@@ -282,7 +282,7 @@ def poll(
     deadline_ns: int,
     others: Callable[[int, Frame], None] = lambda bus, frame: None,
 ) -> Answers:
-    """Ask nodes for one entry.
+    """Ask nodes for one entry by SDO, in bursts until a deadline; return the values and aborts that came.
 
     Args:
         links: of the arm's buses.

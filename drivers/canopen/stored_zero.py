@@ -62,7 +62,7 @@ class Zeros:
         return zlib.crc32(repr((_WHOSE, self._about[number], counts)).encode()) or 1
 
     def held(self, objects: Objects, number: int) -> int | None:
-        """Return the counts at home that a drive confirms, signed; None where it does not. Raises as `Objects.read`."""
+        """Return the signed counts at home that a drive stores with a mark that fits them; else None."""
         try:
             mark = objects.read(od.ZERO_MARK)
             counts = signed(objects.read(od.ZERO_COUNTS)) if mark else 0
@@ -78,7 +78,7 @@ class Zeros:
         objects.set(Write(od.ZERO_MARK, self.mark(number, counts)))
 
     def restore_mark(self, objects: Objects, number: int, counts: int, restarted: Callable[[], bool]) -> bool:
-        """Store again the counts that a drive confirmed before it was configured, unless it has restarted since.
+        """Store a drive's counts at home again, or delete its mark if it has restarted; return True if stored.
 
         Args:
             objects: of the drive.
@@ -104,7 +104,7 @@ class Zeros:
         objects.set(Write(od.ZERO_MARK, 0))
 
     def require_volatile_storage(self, objects: Objects) -> None:
-        """Check that a drive can hold a zero, and loses it with its power.
+        """Raise DriverError where a drive has no object 1020h for a zero, or would keep it without power.
 
         Raises:
             DriverError: it has no object 1020h, or stores parameters by itself.
@@ -129,7 +129,7 @@ class Zeros:
             )
 
     def home_counts(self, held: Sequence[int | None]) -> list[int]:
-        """Return the counts at home of all drives.
+        """Return `held`, the counts at home of all drives; raises PositionUnknown where one is None.
 
         Args:
             held: counts that each drive confirms.
@@ -152,6 +152,6 @@ class Zeros:
 
 
 def zeros_of(config: ArmConfig) -> Zeros | None:
-    """Return the zeros of an arm whose encoders need them, else None; raises as `Zeros`."""
+    """Return the zeros of an arm whose encoders need them (`zero: at_home`), else None; raises as `Zeros`."""
     needed = isinstance(config.driver, CanopenDriver) and config.driver.zero == "at_home"
     return Zeros(config) if needed else None

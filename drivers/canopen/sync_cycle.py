@@ -164,13 +164,13 @@ class Buses:
         link.send(Frame(SDO_REQUEST + self.drives[number].node, upload_request(entry)))
 
     def mode_shown(self, number: int) -> int | None:
-        """Return the last answer of a drive to `ask` for its mode of operation; None before one."""
+        """Return the mode of operation by a drive's last answer to `ask`; None before one."""
         display = self.modes[number].display
         data = self.drives[number].uploads.get(display.key)
         return display.unpack(data) if data is not None and len(data) == display.kind.size else None
 
     def other_modes(self) -> dict[int, str]:
-        """Return what drives report instead of their mode of operation, by number, and ask one of them anew."""
+        """Describe each drive that does not report its wanted mode, by number; now and then ask one of them again."""
         found = {}
         for number, mode in enumerate(self.modes):
             if (shown := self.mode_shown(number)) != mode.wanted:
@@ -204,7 +204,7 @@ class Buses:
         return Objects(link, self.drives[number].node, codec.receive)
 
     def objects_in_cycles(self, number: int, counts: Sequence[int] | None) -> Objects:
-        """Return the object dictionary of one drive, usable while the others are to miss nothing of their host.
+        """Return one drive's object dictionary, whose requests run cycles of all drives while they wait.
 
         Args:
             number: of the drive.
@@ -222,7 +222,7 @@ class Buses:
         return lambda: drive.boots > 0
 
     def listen(self) -> None:
-        """Listen whether another host drives this arm, before anything is sent that could disturb it.
+        """Listen on all buses, without sending; raises DriverError where another host drives this arm.
 
         Raises:
             DriverError: one does; nothing has been sent.
@@ -247,7 +247,7 @@ class Buses:
                     codec.receive(frame)
 
     def call(self) -> None:
-        """Bring every drive to the NMT state in which it is configured, and wait until all of them answer.
+        """Bring every drive to pre-operational, and wait until all answer by SDO; raises DriverError if some do not.
 
         A drive that was just switched on may still boot, one whose last host died may be operational. Communication is
         not reset: by CiA 402 that is a lost connection, which a drive may answer with a fault (6007h).
@@ -308,19 +308,16 @@ class Buses:
         self.forget_events()
 
     def forget_events(self) -> None:
-        """Discard the events so far: they were expected, or have been reported otherwise."""
+        """Discard all events so far, so that conditions that persist are reported again; count lost answers from 0."""
         for codec in self.codecs:
             codec.forget_events()
         self.lost = 0
 
     def cycle(self, counts: Sequence[int] | None) -> int:
-        """Wait for the next cycle and exchange its frames.
+        """Wait for the next cycle and exchange its frames; return when SYNC was sent [ns of the links' clock].
 
         Args:
             counts: torque of every drive [per mille of rated torque]; None for SYNC alone.
-
-        Returns:
-            When SYNC was sent, on the link's clock [ns].
 
         Raises:
             DriverError: a bus is gone, or torques that cannot be sent, of which none has been.
@@ -374,7 +371,7 @@ class Buses:
             self.ask(silent[self._asked % len(silent)], od.STATUS_WORD)
 
     def keep_alive(self) -> None:
-        """Send the host's heartbeat at half of its period, so that a late one is not missed; poll guarded drives."""
+        """Send the host's heartbeat where half of its period is over, and poll the guarded drives."""
         now_ns = self.clock.now_ns()
         self._send_node_guarding(now_ns)
         if now_ns >= self._heartbeat_ns and "heartbeat" not in self.withheld:
@@ -478,7 +475,7 @@ class EnableSequence:
         return self._target == len(_WAY)
 
     def commands(self, now_ns: int) -> list[tuple[int, int]]:
-        """Return the control words to send in this cycle, with the numbers of their drives.
+        """Return (drive number, control word) pairs to send in this cycle; raises on a fault or when time is over.
 
         Raises:
             DriveFaulted: a drive has a fault; which, and why as far as it is known.
@@ -558,7 +555,7 @@ class Resetting:
         return all(drive.state not in (*FAULTS, DriveState.UNKNOWN) for drive in self._drives)
 
     def commands(self, now_ns: int) -> list[tuple[int, int]]:
-        """Return the control words to send in this cycle; DriverError when the time is over and a fault persists."""
+        """Return (drive number, control word) pairs to send in this cycle; DriverError if a fault outlasts the time."""
         if self.done:
             return []
         if now_ns > self._deadline_ns:

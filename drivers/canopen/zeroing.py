@@ -35,10 +35,7 @@ class ZeroingArm(MonitoringArm):
         """Do nothing before the counts are taken."""
 
     def set_home(self) -> tuple[str, ...]:
-        """Store in every drive its present counts as those at home.
-
-        Returns:
-            The state of each drive in words.
+        """Store in every drive its present counts as those at home; return each drive's state in words.
 
         Raises:
             DriverError: not open, an arm without `zero: at_home`, a drive that does not answer, is powered, or cannot

@@ -46,7 +46,7 @@ class StopSecuring(Enum):
 
 
 def joints_with_weight(model: ArmModel, limits: MotionLimits) -> tuple[str, ...]:
-    """Return the names of the joints whose gravity torque is not negligible in some posture; brakes do not count.
+    """Return the joints whose gravity torque exceeds 0.1 % of their torque limit in a sampled posture, braked or not.
 
     Args:
         model: model with prior parameters.
@@ -65,7 +65,7 @@ def joints_with_weight(model: ArmModel, limits: MotionLimits) -> tuple[str, ...]
 
 
 def after_stop(model: ArmModel, limits: MotionLimits) -> StopSecuring:
-    """Return how this arm is secured after a stop: braked, held or lowered.
+    """Return how the arm is secured after a stop: as configured, else by its brakes; raises where joints would fall.
 
     Args:
         model: model with prior parameters.
@@ -107,7 +107,7 @@ class Anchor:
         self._place = position.copy()
 
     def back(self, position: Vector) -> Vector:
-        """Return how far each joint is to be brought back [rad or m], shape (joints,); beyond that the hold yields."""
+        """Return anchor minus position [rad or m], (joints,), clipped to the give; beyond, a joint drags its anchor."""
         pull = np.clip(self._place - position, -self._give, self._give)
         self._place = position + pull
         return pull
@@ -138,11 +138,11 @@ class Lowering:
         self._still = STILL * RESTING * limits.velocity
 
     def beyond(self, position: Vector) -> Vector:
-        """Return how far each joint is to be brought back inside its position limits [rad or m], shape (joints,)."""
+        """Return the displacement that brings each joint inside its position limits [rad or m], (joints,); 0 inside."""
         return np.clip(position, self._limits.lower, self._limits.upper) - position
 
     def update(self, stamp_ns: int, position: Vector, velocity: Vector) -> bool:
-        """Update the share of compensated gravity for one cycle, and return whether the arm has come to rest.
+        """Update the share of compensated gravity for one cycle; return True once it is 0 and no joint moved for 0.5 s.
 
         Args:
             stamp_ns: stamp of the cycle [ns].

@@ -26,7 +26,7 @@ GROUP = "ident_service.drivers"
 
 
 def make_arm(config: ArmConfig, clock: Clock | None = None) -> Arm:
-    """Create the arm that a configuration describes, not yet open.
+    """Create the arm of a configuration with the driver that its `driver.kind` names; it is not opened yet.
 
     Args:
         config: configuration whose `driver.kind` names an entry point of the group `ident_service.drivers`.
@@ -85,12 +85,12 @@ Step = tuple[str, Callable[[Arm], None]]
 
 
 def try_driver(config: ArmConfig, confirm: Callable[[str], str], arm: Arm | None = None) -> tuple[Promise, ...]:
-    """Try a driver on all promises that can be tried on this arm.
+    """Open an arm, test each promise of the driver contract on it, with no torque but zero, and return the outcomes.
 
     Args:
         config: of the arm.
-        confirm: function that shows a question and returns what a person typed; called once, before the arm is
-            energised.
+        confirm: function that shows a question and returns what a person typed; called before the arm is energised,
+            unless a promise is broken by then.
         arm: the arm, not open; the configured one when None.
 
     Raises:
@@ -309,7 +309,7 @@ def _afterwards() -> Iterator[Step]:
 
 
 def contract_text(name: str, found: tuple[Promise, ...]) -> str:
-    """Format the promises as text."""
+    """Format the tested promises as text: a summary line, then each with its outcome, and the reason if not kept."""
     broken = sum(one.outcome is Outcome.BROKEN for one in found)
     skipped = sum(one.outcome is Outcome.NOT_TRIED for one in found)
     verdict = f"{broken} broken" if broken else f"all kept, {skipped} not tried" if skipped else "all kept"

@@ -69,7 +69,7 @@ class ClearanceChecker:
         self._limits = limits
 
     def require_clear(self, reference: Reference, limits: MotionLimits) -> Generator[None, None, None]:
-        """Prove that a trajectory keeps clear and that no stop out of it touches, in slices for single control cycles.
+        """Check that a trajectory and stops out of it keep clear, a few postures a yield; raises MotionRefused if not.
 
         Where the arm stands nearer to something than the clearance, as after a stop, half of that distance is kept.
 
@@ -115,7 +115,7 @@ class ClearanceChecker:
 def trajectory_stop_contact(
     collision: CollisionModel, reference: Reference, limits: MotionLimits
 ) -> Generator[None, None, str | None]:
-    """Describe the first stop out of a trajectory that touches, by the bodies themselves, or None; in slices."""
+    """Describe the first stop out of a trajectory in which bodies touch, by exact shapes, else None; in slices."""
     for time in np.arange(0.0, reference.duration, _BEGINS).tolist():
         stopping = stop(reference.at(time), limits)
         yield
@@ -137,7 +137,7 @@ def _touches(what: str, time: float, pair: str | None, distance: float) -> str:
 def trajectory_clearance(
     collision: CollisionModel, reference: Reference, limits: MotionLimits, least: float
 ) -> Clearance:
-    """Compute the certified clearance of a trajectory within the velocity limits; proven if at least `least` [m]."""
+    """Return the certified lower bound of a trajectory's distance to anything; proven if it is at least `least` [m]."""
 
     def position(time: Vector) -> Vector:
         return np.array([reference.at(float(t)).position for t in time])
@@ -146,7 +146,7 @@ def trajectory_clearance(
 
 
 def motion_stop_clearance(path: Path, limits: MotionLimits, model: ArmModel) -> Nearest:
-    """Return the smallest distance on stops out of a motion, bodies replaced by capsules around them."""
+    """Return the smallest distance in sampled stops out of a motion, with pair and time, by capsules around bodies."""
     capsules = CapsuleModel(model)
     nearest = Nearest(float("inf"), None, 0.0)
     if not capsules.pairs:
@@ -164,7 +164,7 @@ def motion_stop_clearance(path: Path, limits: MotionLimits, model: ArmModel) -> 
 
 
 def motion_stop_contact(path: Path, limits: MotionLimits, model: ArmModel) -> str | None:
-    """Describe the stop out of a motion that comes nearest to anything; None where no stop touches, by capsules."""
+    """Describe the stop out of a motion in which bodies touch or overlap most, by capsules; None where none touches."""
     nearest = motion_stop_clearance(path, limits, model)
     if nearest.distance > 0.0:
         return None
@@ -172,7 +172,7 @@ def motion_stop_contact(path: Path, limits: MotionLimits, model: ArmModel) -> st
 
 
 def require_clear(model: ArmModel, path: Path, trajectories: Sequence[Reference], limits: MotionLimits) -> None:
-    """Refuse a run that would come too near to anything.
+    """Raise MotionRefused where the motion or a trajectory comes within the clearance, or a stop out of it touches.
 
     Args:
         model: model of the arm, with its geometry and surroundings; without any, nothing is checked.
@@ -196,7 +196,7 @@ def require_clear(model: ArmModel, path: Path, trajectories: Sequence[Reference]
 def require_clear_trajectories(
     model: ArmModel, trajectories: Sequence[tuple[str, Reference]], limits: MotionLimits
 ) -> None:
-    """Refuse trajectories that come too near to anything, or out of which a stop would touch something.
+    """Raise MotionRefused where a trajectory comes within the clearance of anything, or a stop out of it touches.
 
     Args:
         model: model of the arm, with its geometry and surroundings; without any, nothing is checked.
@@ -243,13 +243,13 @@ def position_limit_violations(position: Vector, limits: MotionLimits, names: Seq
 
 
 def recoverable_limits(limits: MotionLimits) -> MotionLimits:
-    """Return the position limits widened to where an arm may still be led back from."""
+    """Return limits whose position range is wider by the following error: from there an arm may still be led back."""
     more = limits.following_error
     return replace(limits, lower=limits.lower - more, upper=limits.upper + more)
 
 
 def require_near(position: Vector, limits: MotionLimits, names: Sequence[str]) -> None:
-    """Refuse to move an arm that stands farther outside its position limits than its following error.
+    """Raise MotionRefused where a joint stands farther outside its position limits than its following error.
 
     Raises:
         MotionRefused: naming every such joint.
@@ -263,7 +263,7 @@ def require_near(position: Vector, limits: MotionLimits, names: Sequence[str]) -
 
 
 def relaxed_limits(position: Vector, limits: MotionLimits, share: float = SAG) -> MotionLimits:
-    """Return limits for a trajectory that begins outside: just wide enough to include the start.
+    """Return limits widened, where a joint stands outside, to its position and `share` of the following error more.
 
     Args:
         position: present position of the arm [rad or m], shape (joints,).
@@ -282,7 +282,7 @@ def relaxed_limits(position: Vector, limits: MotionLimits, share: float = SAG) -
 
 
 def just_inside(position: Vector, limits: MotionLimits) -> Vector:
-    """Return the nearest posture inside by a quarter of the following error, or of the range where that is less.
+    """Return `position`, joints outside moved inside their limit by 1/4 of following error or range, the lesser.
 
     Joints that stand inside stay where they are. So far in, an arm that stops short of its reference, because friction
     holds it, is inside nevertheless.

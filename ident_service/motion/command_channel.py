@@ -10,7 +10,7 @@ lock. Stop needs no lease. Hold-to-run is nothing but a short lease.
 | 0 | 8 bytes | `identctl` |
 | 8 | uint32 | version |
 | 12 | uint32 | pid of the process that moves the arm |
-| 16 | uint8 | stop: not 0 for a controlled stop; never taken back |
+| 16 | uint8 | stop: not 0 for a controlled stop; only a request home takes it back |
 | 17 | uint8 | pause: not 0 while the arm shall stand |
 | 18 | uint8 | finish: not 0 when the run shall end early, in order; never taken back |
 | 19 | uint8 | waiting: not 0 while the arm is held until a person confirms that it is supported; of the loop |
@@ -80,24 +80,24 @@ class Controls(Protocol):
 
     @property
     def finish(self) -> bool:
-        """Return whether the rest of the motion is to be left out: the arm rests, and goes back to where it stood."""
+        """Return whether the run is to end early: the arm comes to rest and goes straight back to where it began."""
 
     @property
     def supported(self) -> bool:
-        """Return whether a person has confirmed, since the arm began to wait for it, that it is supported or home."""
+        """Return whether a person has confirmed, since the present hold began, that the arm is supported or home."""
 
     def announce_hold(self) -> None:
         """Announce that the arm is held until a person confirms that it is supported; called once for each hold."""
 
     @property
     def homing(self) -> Homing:
-        """Return whether a person wants the held arm led home, and the stage of that."""
+        """Return the stage of leading the held arm home: `NONE` until a person asks for it, then `ASKED`."""
 
     def tell_homing(self, stage: Homing) -> None:
-        """Set the stage of leading the arm home; from `GOING` on, the lease of its requester counts."""
+        """Set the stage of leading the arm home; while it is `GOING`, `lease_ok` checks the requester of that."""
 
     def lease_ok(self, now_ns: int) -> bool:
-        """Return whether the requester of the motion is still alive, at this time of the loop's clock [ns]."""
+        """Return whether the requester of the motion is alive, as by a lease, at `now_ns` of the loop's clock."""
 
 
 class StopCondition:
@@ -150,7 +150,7 @@ class ControlFile:
         now_ns: Callable[[], int] = time.monotonic_ns,
         requested_ns: int | None = None,
     ) -> Self:
-        """Take the controls of the arm as the process that moves it: all controls off, the lease renewed.
+        """Lock the control file as the process that moves the arm, set its controls off and renew the lease.
 
         Only a stop that was asked for after `requested_ns` is there from the beginning.
 
@@ -190,7 +190,7 @@ class ControlFile:
 
     @classmethod
     def reach(cls, path: Path, now_ns: Callable[[], int] = time.monotonic_ns) -> Self:
-        """Open the controls of an arm that another process moves.
+        """Open the control file of an arm that another process moves, which holds its lock; UsageError if none does.
 
         Raises:
             UsageError: no process moves the arm.
@@ -209,14 +209,11 @@ class ControlFile:
 
     @classmethod
     def stop_motions(cls, path: Path, now_ns: Callable[[], int] = time.monotonic_ns) -> int | None:
-        """Stop the motion of an arm under control, and every motion that was asked for but has not begun.
+        """Request a stop of the motion under way and of all not yet begun; return the moving process's id or None.
 
         Args:
             path: path of the file, which is made where it is missing.
             now_ns: the clock of `take`.
-
-        Returns:
-            The id of the process that moves the arm; None where none does.
 
         Raises:
             UsageError: the file cannot be written; an arm that moves has been stopped all the same.
@@ -251,7 +248,7 @@ class ControlFile:
         return self._memory[_STOP] != 0
 
     def request_stop(self) -> None:
-        """Bring the arm to a controlled stop; needs no lease and cannot be taken back."""
+        """Request a controlled stop, without waiting for it; needs no lease; only `request_home` takes it back."""
         self._memory[_STOP] = 1
 
     @property
@@ -260,16 +257,16 @@ class ControlFile:
         return self._memory[_PAUSE] != 0
 
     def request_pause(self, wanted: bool) -> None:
-        """Pause the arm, or let it go on."""
+        """Request that the arm pause (True) or go on (False), without waiting for it."""
         self._memory[_PAUSE] = int(wanted)
 
     @property
     def finish(self) -> bool:
-        """Return whether the run is to end early, where it began."""
+        """Return whether the run was asked to end early, by going back to where it began."""
         return self._memory[_FINISH] != 0
 
     def request_finish(self) -> None:
-        """Let the run end early, in order; cannot be taken back. A paused arm stays paused until it may go on."""
+        """Request that the run end early, where it began; not revocable. A paused arm must be let go on first."""
         self._memory[_FINISH] = 1
 
     @property
@@ -278,17 +275,17 @@ class ControlFile:
         return self._memory[_WAITING] != 0
 
     def announce_hold(self) -> None:
-        """Announce that the arm is held until a person confirms that it is supported; for the process that moves it."""
+        """Mark in the file that the arm is held until a person confirms its support; clear an earlier confirmation."""
         self._memory[_SUPPORTED] = 0
         self._memory[_WAITING] = 1
 
     @property
     def supported(self) -> bool:
-        """Return whether a person has confirmed the support since the arm began to wait for it."""
+        """Return whether a person has confirmed, since the present hold began, that the arm is supported or home."""
         return self._memory[_SUPPORTED] != 0
 
     def confirm_support(self) -> None:
-        """Confirm, as a person who sees it, that the arm is supported or home; cannot be taken back.
+        """Confirm for a person who sees it that the held arm is supported or home, whereupon the loop lowers it.
 
         Raises:
             UsageError: the arm does not wait for it; confirmed beforehand, it would release an arm that still moves.
@@ -299,17 +296,17 @@ class ControlFile:
 
     @property
     def homing(self) -> Homing:
-        """Return the stage of leading a held arm home."""
+        """Return the stage of leading a held arm home; `NONE` where nobody has asked for that."""
         return Homing(self._memory[_HOMING])
 
     def tell_homing(self, stage: Homing) -> None:
-        """Set the stage of leading a held arm home; for the process that moves it."""
+        """Set the stage of leading a held arm home, as the process that moves it; `GOING` ends the wait for support."""
         if stage is Homing.GOING:
             self._memory[_WAITING] = 0
         self._memory[_HOMING] = stage
 
     def request_home(self) -> None:
-        """Have the arm, which is held after a stop, led home; `renew_home` from now on, four times a second.
+        """Request that the held arm be led home, and clear stop and pause; then call `renew_home` four times a second.
 
         Raises:
             UsageError: the arm is not held; one that moves is stopped before it is led elsewhere.
@@ -336,7 +333,7 @@ class ControlFile:
         self._words[_RENEWED // 8] = self._now_ns()
 
     def lease_is_valid(self) -> bool:
-        """Return whether the lease of the requester of the motion was renewed in time; True for a run without one."""
+        """Return whether the lease of the motion's requester was renewed within its length; True without a lease."""
         renewed, length = self._words[_RENEWED // 8], self._words[_LENGTH // 8]
         return length == 0 or self._now_ns() - renewed <= length
 
@@ -379,7 +376,7 @@ def stop_requested_ns(path: Path) -> int:
 
 
 def in_use(path: Path) -> bool:
-    """Return whether a process moves the arm of a control file."""
+    """Return whether a process holds the lock of a control file, as the one that moves the arm does."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except (FileNotFoundError, NotADirectoryError):
@@ -456,16 +453,16 @@ class SupervisedCommands:
         return self._controls.homing
 
     def tell_homing(self, stage: Homing) -> None:
-        """Set the stage of leading a held arm home."""
+        """Set the stage of leading a held arm home; while it is `GOING`, `lease_ok` checks that lease."""
         self._controls.tell_homing(stage)
 
     @property
     def cut(self) -> bool:
-        """Return whether the other end of the pipe is closed."""
+        """Return whether the requester's end of the pipe is closed, as it is when the requester has died."""
         return bool(self._poll.poll(0))
 
     def lease_ok(self, now_ns: int) -> bool:
-        """Return whether the requester of the motion is still alive; a system call that does not wait.
+        """Return whether the requester's pipe is open and lease valid; while led home, whether that lease is valid.
 
         The motion home of a held arm has another requester, whose lease counts instead.
         """
@@ -508,7 +505,7 @@ class InterruptibleArm(Arm):
         return self._arm.exchange(torque)
 
     def exchange_position(self, position: Vector) -> Sample:
-        """Exchange with the wrapped arm; raises DriverError instead of sending a position likewise."""
+        """Exchange positions with the wrapped arm; raises DriverError instead once a stop was asked for."""
         self._require_no_stop_request()
         return self._arm.exchange_position(position)
 
@@ -517,32 +514,32 @@ class InterruptibleArm(Arm):
         return self._arm.watchdogs()
 
     def withhold(self, kind: str) -> None:
-        """Withhold what watchdogs of one kind watch from the wrapped arm's drives."""
+        """Stop sending what the wrapped arm's watchdogs of one kind watch, until the next `stop`, so that they act."""
         self._arm.withhold(kind)
 
     def bus_budget(self, rate: float | None = None) -> Budget | None:
-        """Return the wrapped arm's bus budget."""
+        """Return the load of the wrapped arm's frames on its buses at `rate` [Hz]; None where none is known."""
         return self._arm.bus_budget(rate)
 
     def setup_checks(self) -> tuple[SetupCheck, ...]:
-        """Return what the wrapped arm's drives report of their set-up."""
+        """Return what the wrapped arm's drives report of their set-up, each value beside the expected one."""
         return self._arm.setup_checks()
 
     @property
     def operator_action(self) -> str:
-        """Return what a person must do to enable the wrapped arm."""
+        """Return in words what a person must do to enable the wrapped arm; empty where the host enables alone."""
         return self._arm.operator_action
 
     def unconfirmed(self) -> tuple[str, ...]:
-        """Return the drives that did not confirm that they are off, see `Arm`."""
+        """Return in words which of the wrapped arm's drives did not confirm at closing that they are off, and why."""
         return self._arm.unconfirmed()
 
     def drive_status(self) -> tuple[AxisStatus, ...]:
-        """Return the wrapped arm's drive status."""
+        """Return the status that each drive of the wrapped arm reported last."""
         return self._arm.drive_status()
 
     def stop(self, kind: StopKind) -> None:
-        """Stop the wrapped arm."""
+        """Stop the wrapped arm's drives in the given way."""
         self._arm.stop(kind)
 
     def close(self) -> None:

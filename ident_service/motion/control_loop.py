@@ -42,13 +42,13 @@ class Sink(Protocol):
 
     @property
     def error(self) -> str:
-        """Return why nothing is recorded any more; empty as long as something is, or the reason is unknown."""
+        """Return the reason why recording has ended; empty while it goes on, or where the reason is unknown."""
 
     def put(self, cycle: Cycle) -> bool:
-        """Take one cycle; returns False when the sink cannot keep up."""
+        """Take one cycle to be recorded; return False where the sink cannot keep up."""
 
     def event(self, stamp_ns: int, level: int, message: str) -> bool:
-        """Take one line of the run's story; returns False when the sink cannot keep up."""
+        """Take one log message of the run, with its severity, to be recorded; return False where the sink lags."""
 
 
 KEPT_SAMPLES: Final = 100
@@ -113,7 +113,7 @@ class Loop:
         self._hold_speed = HOLD_SPEED * self.limits.velocity
 
     def run(self, target: Vector, first: Sample | None = None) -> None:
-        """Cycle until DONE, or until STOPPED and held.
+        """Run control cycles until the state is DONE, or STOPPED and the hold over; raises ArmFault to end torque.
 
         Args:
             target: target of the first cycle, which holds the arm where it stands, shape (joints,): torque [N m or N],
@@ -429,6 +429,6 @@ class Loop:
         return ArmFault(fault.code, fault.message, self.last)
 
     def tell(self, level: int, stamp_ns: int, message: str) -> None:
-        """Send a line of the run's story to the sink."""
+        """Send one log message with its severity to the sink; a sink that raises is ignored."""
         with suppress(Exception):  # a recorder that has failed says so at its next sample
             self.sink.event(stamp_ns, int(level), message)

@@ -69,7 +69,7 @@ class ComputedTorque:
         self.correction = self.answer = self.feedforward = self._none
 
     def torque(self, position: Vector, valid: Flags, reference: Setpoint, elapsed: float | None = None) -> Vector:
-        """Return the computed torque for the next cycle; updates the velocity filter.
+        """Return the computed torque for the next cycle [N m or N], not yet limited; updates the velocity filter.
 
         Args:
             position: measured position [rad or m], shape (joints,).
@@ -99,7 +99,7 @@ class ComputedTorque:
         elapsed: float | None = None,
         back: Vector | float = 0.0,
     ) -> Vector:
-        """Return the torque that damps motion and compensates gravity, without a position reference.
+        """Return the torque that damps motion, compensates a share of gravity and pulls by `back`; not yet limited.
 
         Args:
             position: as for `torque`.

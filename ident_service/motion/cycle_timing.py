@@ -54,7 +54,7 @@ class Histogram:
         return self.worst_ns / 1e3
 
     def document(self) -> dict[str, Any]:
-        """Return the histogram as JSON values."""
+        """Return counts, bin edges, worst time and quantiles [us] as a dict for JSON."""
         return {
             "count": self.count,
             "worst_us": self.worst_ns / 1e3,
@@ -76,7 +76,7 @@ LONGEST_GAP = 20  # periods without a cycle, in which the arm is not supervised 
 
 
 def longest_stall(described: float | None, period: float, watchdogs: Iterable[Watchdog]) -> float:
-    """Return the longest stall that a motion survives [s].
+    """Return the longest tolerated stall [s]: described or default, capped by half of each watchdog and a silent gap.
 
     Args:
         described: `control.longest_stall` of the arm's description [s].
@@ -170,19 +170,16 @@ class Deadlines:
 
     @property
     def known(self) -> bool:
-        """Return whether `elapsed` is the true time between the last two samples."""
+        """Return whether `elapsed` is the true time between the last two samples, else the longest it may be."""
         return self._of.known
 
     def cycle(self, stamp_ns: int, woken_ns: int, doubt_ns: int = 0) -> Fault | None:
-        """Check whether a cycle came on time, and return a fault where it came too late or too many did.
+        """Return the fault of a cycle that is late, after a silence or of a jumped stamp, else None; updates lateness.
 
         Args:
             stamp_ns: of its sample [ns].
             woken_ns: the loop's clock after the exchange [ns].
             doubt_ns: how much earlier than its stamp the sample may have been taken [ns].
-
-        Returns:
-            The fault found, if any.
         """
         period = self._period_ns
         self.elapsed = self._of(stamp_ns, doubt_ns)

@@ -92,7 +92,7 @@ class Woken:
 
     @property
     def seconds(self) -> float:
-        """Return the measured time [s]."""
+        """Return the duration of the measurement [s]: the number of slots times their period."""
         return len(self.late) * self.period
 
     def share(self, share: float) -> float:
@@ -120,7 +120,7 @@ class Held:
 
 
 def kernel_findings(settings: Realtime, root: Path = Path("/")) -> list[Finding]:
-    """Look at the kernel and at what this user may ask of it.
+    """Return the findings on this kernel's real-time features and this user's privileges, one for each check.
 
     Args:
         settings: of the arm's description.
@@ -139,7 +139,7 @@ def kernel_findings(settings: Realtime, root: Path = Path("/")) -> list[Finding]
 
 
 def bus_findings(config: ArmConfig, root: Path = Path("/")) -> list[Finding]:
-    """Look at the CAN interfaces of the kernel that an arm names; none where it names none."""
+    """Return one finding for each CAN interface of the kernel that an arm names; empty where it names none."""
     return [_interface(bus, root) for bus in config.can_buses if bus.medium == "kernel"]
 
 
@@ -150,7 +150,7 @@ def measure_wake_up(
     clock: Clock | None = None,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> Woken:
-    """Measure how late a loop is woken that sleeps from slot to slot, as that of a motion does.
+    """Sleep from slot to slot at `rate` under real-time privileges, and return how late each slot was reached.
 
     Args:
         rate: rate of the slots [Hz].
@@ -179,12 +179,12 @@ def measure_wake_up(
 
 
 def measuring_rate(rate: float) -> float:
-    """Return the rate at which to measure, of which `rate` [Hz] is a whole part."""
+    """Return the lowest whole multiple of `rate` [Hz] that is at least `LEAST_RATE`."""
     return rate * max(1, math.ceil(LEAST_RATE / rate))
 
 
 def judge_rates(woken: Woken, rate: float, described: float | None, watchdogs: tuple[Watchdog, ...] = ()) -> list[Held]:
-    """Judge which rates were held all the time, the highest first.
+    """Judge the measured rate and parts of it, highest first: held if no stall is too long and few cycles are lost.
 
     Args:
         woken: lateness that was measured.

@@ -58,7 +58,7 @@ class EncoderCoordinates:
 
     @staticmethod
     def of(coupling: Vector | None, joints: int) -> EncoderCoordinates:
-        """Return the coordinates of an arm.
+        """Return the coordinates of an arm's joints and of those drives that move several joints, from their coupling.
 
         Args:
             coupling: drive coordinates per joint coordinates, shape (joints, joints); each joint's own drive when None.
@@ -70,7 +70,7 @@ class EncoderCoordinates:
         return EncoderCoordinates(coupling[shared], np.linalg.inv(coupling).T[shared])
 
     def steps(self, position: Vector, before: Vector) -> Vector:
-        """Return by how much each has changed [rad or m], shape (joints + drives,)."""
+        """Return the change of each joint and drive since the position `before` [rad or m], (joints + drives,)."""
         change = position - before
         if not len(self.motions):
             return np.asarray(change)
@@ -79,37 +79,37 @@ class EncoderCoordinates:
         return np.concatenate([change, np.where(np.abs(drives) > _SAME, drives, 0.0)])
 
     def valid(self, valid: Flags) -> Flags:
-        """Return which are known, from the joints whose positions are valid."""
+        """Return which joints and drives are known: a drive is where all joints that it moves are valid."""
         if not len(self.motions):
             return valid
         return np.append(valid, (valid | (self.motions == 0.0)).all(axis=1))
 
     def velocities(self, of_joints: Vector) -> Vector:
-        """Return velocities or accelerations of joints in these coordinates, shape (joints + drives,)."""
+        """Append the drives' velocities (or accelerations) to those of the joints, shape (joints + drives,)."""
         return np.append(of_joints, self.motions @ of_joints) if len(self.motions) else of_joints
 
     def forces(self, of_joints: Vector) -> Vector:
-        """Return torques of joints in these coordinates [N m or N], shape (joints + drives,)."""
+        """Append the drives' torques to those of the joints [N m or N], shape (joints + drives,)."""
         return np.append(of_joints, self.torques @ of_joints) if len(self.torques) else of_joints
 
     def largest_motions(self, of_joints: Vector) -> Vector:
-        """Return what motions of at most so much each can come to, shape (joints + drives,)."""
+        """Append each drive's largest motion if every joint moves by at most its value, shape (joints + drives,)."""
         return np.append(of_joints, np.abs(self.motions) @ of_joints)
 
     def largest_forces(self, of_joints: Vector) -> Vector:
-        """Return the torque that a drive gives when one joint alone needs so much, the most of its joints."""
+        """Append each drive's torque if only its most demanding joint needs its value, shape (joints + drives,)."""
         drives = np.abs(self.torques) * of_joints
         return np.append(of_joints, drives.max(axis=1, initial=0.0))
 
     def inertias(self, mass_matrix: Vector) -> Vector:
-        """Return the inertia that each has while the others stand [kg m^2 or kg], shape (joints + drives,)."""
+        """Return the inertia of each joint and drive while the others stand [kg m^2 or kg], (joints + drives,)."""
         own = np.diag(mass_matrix)
         if not len(self.torques):
             return own
         return np.append(own, np.einsum("dj,jk,dk->d", self.torques, mass_matrix, self.torques))
 
     def at_joints(self, flags: Flags) -> Flags:
-        """Return the joints that flags concern, those of a drive all, shape (joints,)."""
+        """Return which joints are flagged, by themselves or through a drive that moves them, shape (joints,)."""
         joints = self.motions.shape[1]
         if not len(self.motions):
             return flags
@@ -163,7 +163,7 @@ class FrozenEncoderObserver:
         position: Vector,
         feedforward: Vector | float = 0.0,
     ) -> Flags:
-        """Update the missing motion for one cycle, and return which encoders cannot hide it.
+        """Update the estimated unseen motion; return which joints and drives exceed what an encoder can hide.
 
         Args:
             steps: change of each position since the cycle before [rad or m], 0 where it was not measured, shape

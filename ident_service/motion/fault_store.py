@@ -56,12 +56,12 @@ class StoredFault:
     since: float
 
     def document(self) -> dict[str, Any]:
-        """Return the fault as JSON values."""
+        """Return the fault as a dict for JSON: `code`, `cause` and `written`, its time."""
         return {"code": self.code, "cause": self.cause, "written": self.since}
 
     @classmethod
     def from_document(cls, document: Any) -> Self:
-        """Return the fault of JSON values; raises one of `_UNREADABLE`."""
+        """Create the fault from a dict as `document` returns it; raises one of `_UNREADABLE` where it is none."""
         return cls(str(document["code"]), str(document["cause"]), float(document["written"]))
 
 
@@ -93,11 +93,11 @@ class FaultStore:
         self._faults, self._mark, self._controls = folder / "faults.json", folder / "moving.json", folder / CONTROLS
 
     def latched(self) -> dict[str, str]:
-        """Return the cause of each stored fault by code, the earliest first; raises as `remembered`."""
+        """Return a dict from code to cause of all stored faults, the earliest first; UsageError on a damaged file."""
         return {one.code: one.cause for one in self.remembered()}
 
     def remembered(self) -> tuple[StoredFault, ...]:
-        """Return all stored faults, the earliest first.
+        """Return all stored faults, and one for a motion whose process died, the earliest first.
 
         Raises:
             UsageError: a file is damaged.
@@ -105,7 +105,7 @@ class FaultStore:
         return self._read_stored(moving=in_use(self._controls))
 
     def began(self, run: Path) -> None:
-        """Mark that this process, which has taken the control file, is about to move the arm.
+        """Write a mark that this process is about to move the arm; MotionRefused while a fault is unacknowledged.
 
         Args:
             run: folder of the run.
@@ -120,9 +120,9 @@ class FaultStore:
         write_atomically(self._mark, json.dumps(mark) + "\n" + " " * _ROOM)
 
     def ended(self) -> None:
-        """Remove the mark of a moving arm: the arm is without torque, and its faults are stored.
+        """Remove the mark of a moving arm; where the mark itself stores faults, note in it that the motion has ended.
 
-        A mark that stores faults itself stays until they are acknowledged.
+        A mark that stores faults stays until they are acknowledged.
 
         Raises:
             UsageError: a file is damaged, or cannot be written.
@@ -135,14 +135,14 @@ class FaultStore:
                 self._mark.unlink(missing_ok=True)
 
     def require_none(self, faults: dict[str, str]) -> None:
-        """Raise MotionRefused, which names the faults, if there are any."""
+        """Raise MotionRefused, which names the given faults (code to cause), unless there are none."""
         if faults:
             words = "; ".join(f"{code} ({cause})" for code, cause in faults.items())
             acks = ", ".join(f"`ident acknowledge {self._arm} {code}`" for code in faults)
             raise MotionRefused(f"{self._arm}: unacknowledged faults: {words}; {acks}")
 
     def latch(self, code: str, cause: str) -> None:
-        """Store a fault; one that is stored already keeps its first cause.
+        """Store a fault on disk; one whose code is stored already keeps its first cause.
 
         Where there is no room on the disk, it is stored in the mark of the moving arm, a long cause without its end.
 
@@ -164,7 +164,7 @@ class FaultStore:
                     self._write_into_mark(mark, line, mark.size - _LAST_LINE)
 
     def acknowledge(self, code: str) -> str:
-        """Remove a fault from the store; returns its cause.
+        """Remove a fault from the store and return its cause; UsageError if it is not stored or the arm is still held.
 
         Raises:
             UsageError: no fault of this name is latched, or a file was damaged by somebody; or the arm is still held

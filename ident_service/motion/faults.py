@@ -51,7 +51,7 @@ class Reaction(IntEnum):
 
     @property
     def stop_kind(self) -> StopKind:
-        """Return how the drives end torque under this reaction, immediately or after lowering or holding."""
+        """Return how drives end torque after this reaction: at once for `TORQUE_OFF`, else by a quick stop."""
         return StopKind.TORQUE_OFF if self is Reaction.TORQUE_OFF else StopKind.QUICK_STOP
 
 
@@ -84,7 +84,7 @@ class Rule:
 
     @property
     def severity(self) -> Severity:
-        """Return the severity that follows from the reaction."""
+        """Return the severity by the reaction: WARNING for `WARN`, FATAL from `QUICK_STOP` on, else ERROR."""
         if self.reaction is Reaction.WARN:
             return Severity.WARNING
         return Severity.FATAL if self.reaction >= Reaction.QUICK_STOP else Severity.ERROR
@@ -183,7 +183,7 @@ class Fault:
 
     @property
     def severity(self) -> Severity:
-        """Return the severity of the fault, from the table."""
+        """Return the severity that the fault table gives to this fault's code."""
         return FAULTS[self.code].severity
 
 
@@ -201,7 +201,7 @@ class FaultCounter:
         self._recent: dict[str, deque[int]] = {}
 
     def found(self, code: str, what: str) -> Fault:
-        """Return a fault of the table, or the fault that a warning becomes when it is found too often.
+        """Create the fault of a code; a warning found in too many recent cycles gives the graver fault it becomes.
 
         Args:
             code: name of the fault in the table.
@@ -246,11 +246,11 @@ class ActiveFaults:
         return tuple(self._faults.values())
 
     def set(self, code: str, cause: str, since_ns: int) -> None:
-        """Latch a fault; one that is latched already keeps its first cause and time."""
+        """Add a fault to the active ones; one that is active already keeps its first cause and time."""
         self._faults.setdefault(code, ActiveFault(code, cause, since_ns))
 
     def acknowledge(self, code: str) -> ActiveFault:
-        """Acknowledge one fault: remove and return it.
+        """Remove an active fault by its code and return it; raises UsageError where it is not active.
 
         Raises:
             UsageError: no fault of this code is latched; a person must acknowledge a known fault.

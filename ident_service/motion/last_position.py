@@ -55,11 +55,11 @@ class PositionFile:
         self._path, self._config = folder / FILE, config
 
     def forget(self) -> None:
-        """Forget it: the arm is about to move, and where it will stand nobody knows."""
+        """Delete the stored position, before the arm moves."""
         self._path.unlink(missing_ok=True)
 
     def keep(self, arm: Arm) -> None:
-        """Keep where a closed arm stands, or forget what was kept where it moves, or does not tell.
+        """Watch a closed arm briefly and store where it stands; delete the stored position if it moves or is silent.
 
         Arms that are new whenever they are opened, simulated ones, have no such position.
         """
@@ -78,7 +78,7 @@ class PositionFile:
                 write_atomically(self._path, json.dumps(document, indent=1) + "\n")
 
     def require_no_lost_turns(self, arm: Arm) -> None:
-        """Look at an open arm once, and refuse to move one whose motors seem to have turned by whole turns.
+        """Read an open arm's position; MotionRefused where all motors turned by whole turns since it was closed.
 
         Raises:
             MotionRefused: they do.
@@ -110,12 +110,12 @@ class PositionFile:
 
 
 def is_new_every_time(arm: Arm, config: ArmConfig) -> bool:
-    """Return whether an arm begins anew whenever it is opened, as simulated ones do."""
+    """Return whether an arm starts anew at each opening: a lock-step clock, no driver, or a simulated one."""
     return arm.clock.lock_step or config.driver is None or config.driver.kind == "simulated"
 
 
 def turned(last: LastPosition, position: Vector, config: ArmConfig) -> str:
-    """Say which motors seem to have turned by whole turns since an arm was closed; empty where none has.
+    """Describe the motors that turned by whole turns since an arm was closed; empty if none, or one by a fraction.
 
     Somebody may have moved the arm by hand. That all motors have turned by whole turns, and one by more than none, is
     what lost turns look like, and hardly what a hand does.

@@ -61,17 +61,17 @@ class TimedSink:
 
     @property
     def error(self) -> str:
-        """Return why nothing is recorded any more, empty while something is."""
+        """Return the reason why recording has ended; empty while it goes on."""
         return self._sink.error
 
     def put(self, cycle: Cycle) -> bool:
-        """Record one cycle."""
+        """Count a cycle's lateness and computing time, and pass it to the sink; return False where that lags."""
         self.lateness.add(cycle.lateness_ns)
         self.compute.add(cycle.compute_ns)
         return self._sink.put(cycle)
 
     def event(self, stamp_ns: int, level: int, message: str) -> bool:
-        """Record one line of the story; states, faults, and what is done with a held arm are told to the parent too."""
+        """Pass a log message to the sink, and faults, states and holds to the parent; return False if the sink lags."""
         if level >= Severity.ERROR:
             send_line(
                 {"fault": message}
@@ -86,13 +86,13 @@ class TimedSink:
 
 
 def send_line(line: dict[str, Any]) -> None:
-    """Write one line of JSON to standard output, or nothing where it does not fit at once."""
+    """Write one line of JSON to standard output; it is lost where the pipe is full or closed."""
     with suppress(OSError):
         os.write(sys.stdout.fileno(), json.dumps(line).encode() + b"\n")
 
 
 def main() -> int:
-    """Run the motion that standard input asks for; returns 0 when the run ended in DONE or STOPPED."""
+    """Run the motion that standard input asks for and report to standard output; return 0 after DONE or STOPPED."""
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the terminal's Ctrl-C is for the parent, which asks for a stop
     line = sys.stdin.readline()

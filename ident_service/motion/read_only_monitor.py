@@ -104,7 +104,7 @@ def watch(
     cycles: int | None = None,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> Watched:
-    """Watch an arm for some time, without torque, and summarise the samples.
+    """Open an arm read-only, exchange cycles without torque for `seconds`, close it, and summarise the samples.
 
     Args:
         arm: the arm, not open.
@@ -112,9 +112,6 @@ def watch(
         tell: called with the arm's description and every sample.
         cycles: number of cycles to watch, instead of `seconds`.
         stop_requested: called every cycle; True ends watching with what has been seen.
-
-    Returns:
-        The summary.
 
     Raises:
         UsageError: no time to watch, or more than a day.

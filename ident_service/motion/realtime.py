@@ -88,7 +88,7 @@ class RealtimePrivileges:
 
 
 def request_privileges(core_from_last: int = 0, settings: Realtime | None = None) -> RealtimePrivileges:
-    """Ask for everything; call it once, in the process of the loop, when all that it needs is loaded.
+    """Request real-time priority, locked memory and a core, stop garbage collection; return what was granted.
 
     Args:
         core_from_last: number of the core, counted back from the last; for a second loop beside the first.
@@ -120,7 +120,7 @@ def request_privileges(core_from_last: int = 0, settings: Realtime | None = None
 
 @contextmanager
 def temporary_privileges(core_from_last: int = 0, settings: Realtime | None = None) -> Iterator[RealtimePrivileges]:
-    """Hold the privileges of `request_privileges` for the block, in a process that does other things afterwards.
+    """Request the privileges of `request_privileges`, yield what was granted, and give them back after the block.
 
     Args:
         core_from_last: as for `request_privileges`.
@@ -151,7 +151,7 @@ def temporary_privileges(core_from_last: int = 0, settings: Realtime | None = No
 
 
 def capable(capability: int) -> bool:
-    """Tell if this process has a capability, by its number in linux/capability.h."""
+    """Return whether this process has a capability in effect, by its number in linux/capability.h."""
     with suppress(OSError, ValueError):
         for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines():
             if line.startswith("CapEff:"):
@@ -252,7 +252,7 @@ def _own_core(cores: list[int], described: bool, held: ExitStack, refusals: list
 
 
 def halts(driver: Path) -> bool:
-    """Return whether idle cores halt in spite of `LATENCY`: the kernel has no idle driver, as in a virtual machine.
+    """Return whether the file says that the idle driver is `none`: then idle cores halt in spite of `LATENCY`.
 
     Args:
         driver: the file that names it, `IDLE_DRIVER`.

@@ -58,7 +58,7 @@ _FIRST = -20  # of the nice values
 
 @contextmanager
 def keep_host_alive(arm: Arm) -> Iterator[None]:
-    """Exchange cycles without torque in a background thread for as long as the block lasts, which must not use the arm.
+    """Exchange cycles without torque in a background thread during the block, which must not use the arm.
 
     Args:
         arm: open, not enabled.
@@ -111,7 +111,7 @@ def _wait_for(over: threading.Event) -> None:
 
 @contextmanager
 def unhurried() -> Iterator[None]:
-    """Run the block without real-time priority, at the highest other one, where real time was granted (`realtime.py`).
+    """Run the block at ordinary scheduling with nice -20 where the thread had real-time priority, then restore that.
 
     Cycles in a thread that was started before go first. What works for seconds at a real-time priority starves all else
     on its core, for which the kernel stops every real-time process there for up to 50 ms of a second
@@ -179,7 +179,7 @@ def run(
     latch: ActiveFaults | None = None,
     hold_seconds: float = HOLD,
 ) -> RunReport:
-    """Move an open arm along an excitation and back to where it stood.
+    """Enable an open arm, move it along an excitation and back to where it stood; return the report, or raise ArmFault.
 
     Args:
         arm: the arm, open and not enabled.
@@ -215,7 +215,7 @@ def follow(
     latch: ActiveFaults | None = None,
     hold_seconds: float = HOLD,
 ) -> RunReport:
-    """Follow a plan with an open arm; `run` does this for an excitation.
+    """Enable an open arm and move it along the references of a plan; return the report, or raise ArmFault.
 
     Args:
         arm: the arm, open and not enabled.

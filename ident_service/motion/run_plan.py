@@ -43,16 +43,16 @@ class Plan(Protocol):
 
     @property
     def held(self) -> bool:
-        """Return whether the run ends where nothing may support the arm, which is then held and braked like a stop."""
+        """Return whether the arm is held at the end and secured as after a stop, since nothing may support it there."""
 
     def require_possible(self, model: ArmModel, limits: MotionLimits) -> None:
-        """Raise MotionRefused where no start makes the plan possible."""
+        """Raise MotionRefused where the plan is impossible from any start."""
 
     def admits(self, model: ArmModel, position: Vector, limits: MotionLimits) -> MotionLimits:
-        """Return the limits of this run; MotionRefused where none may begin at this position [rad or m], (joints,)."""
+        """Return the limits of a run from this position [rad or m], (joints,); MotionRefused if it may not begin."""
 
     def legs(self, model: ArmModel, start: Vector, limits: MotionLimits) -> Sequence[Leg]:
-        """Return the references from `start` [rad or m], (joints,), in order; MotionRefused if they lead too near."""
+        """Return (state, reference) pairs from `start` [rad or m], (joints,), in order; MotionRefused if not clear."""
 
 
 @dataclass(frozen=True)
@@ -64,20 +64,20 @@ class ExcitationPlan:
     held = False  # it stands again where it stood, supported, before
 
     def require_possible(self, model: ArmModel, limits: MotionLimits) -> None:
-        """Check that the motion was made for this arm and keeps its limits, and so does every stop out of it."""
+        """Raise MotionRefused where the motion is for another description, or it or a stop out of it exceeds limits."""
         if self.excitation.arm_sha256 != model.config.motion_sha256:
             raise MotionRefused(f"the {self.excitation.name} motion was made for another description of the arm")
         require_within_limits(self.excitation.path, model, limits)
         require_stops_within_limits(self.excitation.path, limits, model.chain.names)
 
     def admits(self, model: ArmModel, position: Vector, limits: MotionLimits) -> MotionLimits:
-        """Return the limits unchanged; the run may begin inside the position limits only."""
+        """Return `limits` unchanged; raise MotionRefused where a joint stands outside its position limits."""
         if found := position_limit_violations(position, limits, model.chain.names):
             raise MotionRefused(f"outside the position limits: {'; '.join(found)}; `ident recover` says what to do")
         return limits
 
     def legs(self, model: ArmModel, start: Vector, limits: MotionLimits) -> Sequence[Leg]:
-        """Return the approach, the excitation and the return."""
+        """Return approach, excitation and return as (state, slowed reference) pairs; MotionRefused if not clear."""
         exciting = PathReference(self.excitation.path)
         begin, end = exciting.at(0.0), exciting.at(exciting.duration)
         there, back = (
@@ -112,7 +112,7 @@ class PointToPointPlan:
         """Do nothing: home is inside the limits by the description's own check, as is the nearest posture inside."""
 
     def admits(self, model: ArmModel, position: Vector, limits: MotionLimits) -> MotionLimits:
-        """Return limits that begin where the arm stands; it may stand no farther outside than a following error."""
+        """Return limits that include where the arm stands; MotionRefused too far outside, or with nothing to leave."""
         require_near(position, limits, model.chain.names)
         if self.destination is Destination.INSIDE and not position_limit_violations(
             position, limits, model.chain.names
@@ -121,7 +121,7 @@ class PointToPointPlan:
         return relaxed_limits(position, limits)
 
     def legs(self, model: ArmModel, start: Vector, limits: MotionLimits) -> Sequence[Leg]:
-        """Return the one reference to the destination."""
+        """Return one (state, slowed reference) pair to home or just inside the limits; MotionRefused if not clear."""
         end = limits.home if self.destination is Destination.HOME else just_inside(start, limits)
         way = plan_reduced_trajectory(rest(start), rest(end), relaxed_limits(start, limits))
         try:

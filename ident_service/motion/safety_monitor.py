@@ -25,7 +25,7 @@ from ident_service.motion.trajectory import Setpoint
 
 
 def fault_from_events(events: Sequence[AxisEvent], names: Sequence[str], findings: FaultCounter) -> Fault | None:
-    """Return the most severe fault among the events of one sample.
+    """Make a fault or a counted warning of each event of a sample; return the most severe one, None without events.
 
     Args:
         events: of the sample.
@@ -129,7 +129,7 @@ class MonitoredSample:
 
 
 def checks(seen: MonitoredSample, limits: MotionLimits) -> Iterator[Check]:
-    """Yield all checks of a sample, ordered by how far the data they need can be believed."""
+    """Yield all checks of a sample, each with the joints that it hits; those for untrustworthy data come first."""
     yield from _what_cannot_be_believed(seen, limits)
     yield from _quick_stop_checks(seen)
     yield from _what_must_end(seen, limits)
@@ -207,7 +207,7 @@ def _what_can_be_bridged(seen: MonitoredSample, limits: MotionLimits) -> Iterato
 
 
 def approach_speed(distance: Vector, limits: MotionLimits) -> Vector:
-    """Return the largest speed allowed towards a position limit.
+    """Return the largest speed allowed towards a position limit [rad/s or m/s], (joints,): sqrt(2 a d) with allowances.
 
     Args:
         distance: distance from the limit, negative beyond it [rad or m], shape (joints,).
@@ -361,7 +361,7 @@ class SafetyMonitor:
         known: bool = True,
         unexplained: Vector | None = None,
     ) -> tuple[Flags, Fault | None]:
-        """Check a sample against all thresholds; returns the usable positions and the most severe fault.
+        """Check a sample against all thresholds; return a mask of usable positions and the most severe fault or None.
 
         Args:
             sample: of this cycle.
@@ -419,13 +419,14 @@ class SafetyMonitor:
         return usable, fault
 
     def torque(self, wanted: Vector) -> tuple[Vector, Fault | None]:
-        """Check and limit a torque; the first torque is not limited in rate, because the support yields to it.
+        """Check a torque; return it limited in size and, but for the first, in rate (0 if refused), and fault or None.
 
         Args:
             wanted: torque demanded by the controller [N m or N], shape (joints,).
 
         Returns:
-            The torque that may leave: within limits, or zero when the fault takes torque away.
+            The torque that may leave: within limits, or zero when the fault takes torque away. The first one is not
+            limited in rate, because the support yields to it.
         """
         limit, before, motors = self._limits.torque, self._sent, self._limits.motors
         size = np.abs(wanted)
@@ -464,14 +465,14 @@ class SafetyMonitor:
         return leaves, fault
 
     def position(self, wanted: Vector) -> tuple[Vector, Fault | None]:
-        """Check and limit the position that drives are given; the first is a step from where the arm stands.
+        """Check a position for the drives; return it limited in step, or the last one if refused; and fault or None.
 
         Args:
             wanted: position demanded by the trajectory [rad or m], shape (joints,).
 
         Returns:
             The position that may leave: no farther from the last one than the joints move in a cycle at `VELOCITY_STOP`
-            times their velocity limit; the last one when the fault ends motion.
+            times their velocity limit, first from where the arm stands; the last one when the fault ends motion.
         """
         finite = np.isfinite(wanted)
         if not finite.all():
@@ -502,7 +503,7 @@ class SafetyMonitor:
         return np.asarray(before + np.where(self._joined, share, 1.0).min(axis=1) * (wanted - before))
 
     def about(self, joint: int, what: str, velocity: float) -> str:
-        """Return the beginning of a sentence about one joint; `{}` in `what` stands for its velocity [rad/s or m/s]."""
+        """Return a joint's name, a colon and `what`, whose `{}` becomes the velocity [rad/s or m/s] with its unit."""
         return f"{self._names[joint]}: {what.format(f'{velocity:.4g} {self._units[joint]}/s')}"
 
     def _quiet(self, position: Vector, wanted: Vector, velocity: Vector) -> bool:

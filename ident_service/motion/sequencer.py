@@ -61,7 +61,7 @@ class Paused:
         return self._stop.at(time)
 
     def resume(self, limits: MotionLimits | None = None) -> Resumed:
-        """Plan a trajectory back onto the motion and the rest of the motion, to be followed once the arm stands.
+        """Plan a trajectory from rest back onto the motion; return it with the rest of that; too slow for a cycle.
 
         It joins the motion where it was left. Where no way leads there within the limits, it joins a little earlier and
         repeats that little; else a little later; else it begins the motion again. This takes a millisecond or few where
@@ -78,7 +78,7 @@ class Paused:
     def resume_in_slices(
         self, limits: MotionLimits | None = None, surroundings: ClearanceChecker | None = None
     ) -> Generator[None, None, Resumed]:
-        """Plan as `resume` does, in slices short enough for a control cycle; the generator returns the resumed motion.
+        """Plan as `resume`, clear of surroundings, in slices for control cycles; the generator returns the same.
 
         Args:
             limits: as for `resume`.
@@ -102,7 +102,7 @@ class Paused:
     def leave_in_slices(
         self, end: Setpoint, limits: MotionLimits, surroundings: ClearanceChecker | None = None
     ) -> Generator[None, None, RuckigReference]:
-        """Plan a straight trajectory at reduced speed to another setpoint at rest, to be followed after the pause.
+        """Plan a straight, slowed trajectory to rest at `end` in slices; the generator returns it or raises.
 
         Args:
             end: setpoint at rest.
@@ -205,7 +205,7 @@ class TrajectorySequencer:
         self.led = False
 
     def at(self, stamp_ns: int) -> Setpoint:
-        """Return the reference of the cycle with this stamp [ns]; states follow each other as their references end."""
+        """Return the setpoint of the cycle with this stamp [ns]; enters the next state where a reference has ended."""
         states = self._states
         if self._begin_ns is None:  # not before: enabling takes as long as it takes
             self._begin_ns = stamp_ns
@@ -226,21 +226,21 @@ class TrajectorySequencer:
         return self.reference
 
     def overdue(self, stamp_ns: int) -> float:
-        """Return for how long the present reference has rested at its end [s]; negative before."""
+        """Return how long ago the present reference ended [s]; negative before its end."""
         return self._elapsed(stamp_ns) - self._way.duration
 
     def skip_to(self, stamp_ns: int) -> None:
-        """Take the reference to a cycle before which others were missed, at most to the end of its trajectory."""
+        """Set the reference to that of this stamp [ns], after missed cycles, at most to its end; no state changes."""
         self.reference = self._way.at(self._elapsed(stamp_ns))
 
     def stop(self, stamp_ns: int) -> None:
-        """Begin a controlled stop, in states that allow one."""
+        """Enter STOPPING and follow a controlled stop from the reference; do nothing in states that allow none."""
         if self._states.state in STOPPABLE:
             self._states.enter(State.STOPPING)
             self._begin_ns, self._way = stamp_ns, stop(self.reference, self._limits)
 
     def pause(self, stamp_ns: int) -> None:
-        """Begin a stop from which the motion can be resumed, where the arm moves."""
+        """Enter PAUSING and follow a stop from which the motion can resume; do nothing where the arm does not move."""
         state, elapsed, back = self._states.state, self._elapsed(stamp_ns), self._back
         if state is State.RESUMING and back is not None:
             paused = Paused(back.motion, back.joined, self._limits, self.reference)
@@ -255,13 +255,13 @@ class TrajectorySequencer:
         self._begin_ns, self._way, self._paused, self._back = stamp_ns, paused, paused, None
 
     def enter_paused(self) -> None:
-        """Enter PAUSED, for an arm that has come to rest; `search_return` then searches for a trajectory back."""
+        """Enter PAUSED, as the arm rests, and begin the search for a trajectory out; `search_return` continues it."""
         self._states.enter(State.PAUSED)
         if self._paused is not None:
             self._search = self._plan_out_of_pause(self._paused)
 
     def finish(self, stamp_ns: int) -> None:
-        """End the run early by way of a pause and a straight return; once, and only before the last reference."""
+        """End the run early by a pause and a straight return; do nothing a second time, or on the last reference."""
         if self._finishing or not self._later or self._states.state not in _UNDER_WAY:
             return
         self._finishing = True
@@ -279,7 +279,7 @@ class TrajectorySequencer:
         return (yield from paused.resume_in_slices(self._resuming, self._surroundings))
 
     def search_return(self) -> str | None:
-        """Do one slice of the search for a trajectory back; return the reason where none exists, else None."""
+        """Do one slice of the search out of a pause; return why none exists, or None if found or still searching."""
         if self._search is None:
             return None
         try:
@@ -296,7 +296,7 @@ class TrajectorySequencer:
         return None
 
     def go_on(self, stamp_ns: int) -> None:
-        """Leave a pause, as soon as a trajectory out of it is found."""
+        """Enter RESUMING or RETURNING along the trajectory found out of the pause; do nothing while there is none."""
         if self._away is not None and self._paused is not None:
             self.finished_at = self._paused.time if self._left is State.EXCITING else 0.0
             self._states.enter(State.RETURNING)
@@ -322,7 +322,7 @@ class TrajectorySequencer:
         self._away, self._search = None, search()
 
     def try_homing(self, stamp_ns: int) -> bool:
-        """Begin to go home as soon as a trajectory is found; returns whether that is in this cycle."""
+        """Enter RETURNING along the trajectory home as soon as one is found; return whether this call did."""
         if self._away is None:
             return False
         self._states.enter(State.RETURNING)

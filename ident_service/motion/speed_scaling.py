@@ -31,13 +31,13 @@ class ScaledMotion:
         self.duration = reference.duration / factor
 
     def at(self, time: float) -> Setpoint:
-        """Return the setpoint at `time` [s]."""
+        """Return the setpoint at `time` [s] of the slowed motion."""
         point = self._reference.at(self._factor * time)
         return Setpoint(point.position, point.velocity * self._factor, point.acceleration * self._factor**2)
 
 
 def slowed_limits(limits: MotionLimits, factor: float) -> MotionLimits:
-    """Return limits within which a reference looks like one within `limits` at `factor` times its speed.
+    """Return limits with velocity scaled by `factor`, acceleration by its square, and jerk by its cube.
 
     Raises:
         UsageError: the factor is not above 0 and at most 1.
@@ -52,7 +52,7 @@ def slowed_limits(limits: MotionLimits, factor: float) -> MotionLimits:
 
 
 def require_factor(factor: float) -> float:
-    """Return the factor, when it is a speed that a motion can be slowed to.
+    """Return the factor unchanged if it is above 0 and at most 1; raises UsageError otherwise.
 
     Raises:
         UsageError: it is not above 0 and at most 1.

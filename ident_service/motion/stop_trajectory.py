@@ -70,7 +70,7 @@ class StopProfile:
         self.end = self._position[-1]
 
     def at(self, time: float) -> Setpoint:
-        """Return the setpoint at `time` [s] of a single motion."""
+        """Return the setpoint at `time` [s] since the stop began; for a profile of a single motion only."""
         time = max(time, 0.0)
         here = ((self._begin <= time).sum(axis=0) - 1, self._joint)
         knot = Setpoint(self._position[here], self._velocity[here], self._acceleration[here])
@@ -102,7 +102,7 @@ _BLOCK = 4096  # samples judged at once, so that a long motion needs no more mem
 
 
 def stop(start: Setpoint, limits: MotionLimits) -> StopProfile:
-    """Return the controlled stop from any state to rest; never raises.
+    """Return the controlled stop from any state to rest, within acceleration and jerk limits; never raises.
 
     Args:
         start: state at the beginning, with arrays of shape (joints,), or (samples, joints) for many stops at once.
@@ -119,7 +119,7 @@ def stop(start: Setpoint, limits: MotionLimits) -> StopProfile:
 
 
 def stop_extent(path: Path, limits: MotionLimits) -> tuple[Vector, Vector]:
-    """Return the lowest and highest position that stops from anywhere on a motion reach, the motion itself included.
+    """Return the lowest and highest positions of a motion and of stops out of it at sampled times [rad or m].
 
     Between two sampled times it may be exceeded slightly; and where stops come so close to a position limit that
     some must brake harder, by how far these settle back from there. Neither leads outside the limits: see above.
@@ -141,7 +141,7 @@ def stop_extent(path: Path, limits: MotionLimits) -> tuple[Vector, Vector]:
 
 
 def require_stops_within_limits(path: Path, limits: MotionLimits, names: tuple[str, ...]) -> None:
-    """Refuse a motion out of which a stop would leave the position limits.
+    """Raise MotionRefused where a stop out of the motion would leave the position limits of a joint.
 
     Args:
         path: the motion.

@@ -78,7 +78,7 @@ class Measure:
 
     @property
     def within_limits(self) -> bool:
-        """Return whether the value keeps its limits; a missing value keeps none."""
+        """Return whether the value is between its limits; True without limits, False where limits lack a value."""
         if self.least is None and self.most is None:
             return True
         if self.value is None:
@@ -138,7 +138,7 @@ def measures(
     least: Vector | None = None,
     most: Vector | None = None,
 ) -> tuple[Measure, ...]:
-    """Create one measure per joint, from arrays of shape (joints,)."""
+    """Create one measure per joint, each of the value, unit, name and limits at its index."""
     return tuple(
         measure(
             what,
@@ -153,7 +153,7 @@ def measures(
 
 
 def check_from_measures(code: str, found: Sequence[Measure], remedy: str) -> Check:
-    """Return a check that passed where every measure keeps its limits, else failed, naming each that does not."""
+    """Return a check: passed where every measure keeps its limits, else failed, naming each that does not."""
     broken = [str(one) for one in found if not one.within_limits]
     if broken:
         return Check(code, Verdict.FAILED, tuple(found), "; ".join(broken), remedy)
@@ -161,17 +161,17 @@ def check_from_measures(code: str, found: Sequence[Measure], remedy: str) -> Che
 
 
 def failed(code: str, reason: str, remedy: str, found: Sequence[Measure] = ()) -> Check:
-    """Return a check that failed."""
+    """Return a check with the verdict FAILED, its reason and remedy."""
     return Check(code, Verdict.FAILED, tuple(found), reason, remedy)
 
 
 def skipped(code: str, reason: str) -> Check:
-    """Return a check that was not made."""
+    """Return a check with the verdict SKIPPED and the reason why it was not made."""
     return Check(code, Verdict.SKIPPED, (), reason)
 
 
 def joint_units(revolute: Sequence[bool], turning: str, sliding: str) -> tuple[str, ...]:
-    """Return the unit of each joint's quantity."""
+    """Return each joint's unit: `turning` for a revolute joint, `sliding` for another."""
     return tuple(turning if turns else sliding for turns in revolute)
 
 
@@ -232,9 +232,9 @@ class Ticket:
 
     @property
     def verdict(self) -> Verdict:
-        """Return FAILED where one check failed, else NEEDS_PERSON where one does, else PASSED.
+        """Return FAILED or NEEDS_PERSON if a check has it, else PASSED if all indispensable ones passed, else FAILED.
 
-        Without an indispensable check it is FAILED, too: `valid_for` would allow nothing.
+        Without an indispensable check `valid_for` would allow nothing.
         """
         found = {check.verdict for check in self.checks}
         for worse in (Verdict.FAILED, Verdict.NEEDS_PERSON):
@@ -247,7 +247,7 @@ class Ticket:
         return {check.verdict for check in self.checks if check.code == code}
 
     def valid_for(self, subject: Subject, now: datetime) -> list[str]:
-        """Return why this ticket does not allow a motion; empty when it does.
+        """Return why this ticket does not allow a motion: checks, expiry, other arm, motion or software; or nothing.
 
         Args:
             subject: subject of the motion that is to begin, with the open arm's own description. One without a motion,
@@ -283,14 +283,14 @@ class Ticket:
         return found
 
     def require_valid_for(self, subject: Subject, now: datetime) -> None:
-        """Raise MotionRefused, which says why, unless this ticket is `valid_for` the motion."""
+        """Raise MotionRefused with the reasons of `valid_for` where this ticket does not allow the motion now."""
         if why := self.valid_for(subject, now):
             raise MotionRefused(
                 f"the preflight ticket is not valid for this: {'; '.join(why)}; `ident preflight` makes a new one"
             )
 
     def with_arm(self, subject: Subject) -> Subject:
-        """Return the subject on the arm of this ticket, to compare all that can be compared before the arm is open."""
+        """Return `subject` with identities, bus and driver of this ticket, to compare the rest with a closed arm."""
         mine = self.subject
         return replace(subject, identities=mine.identities, bus_sha256=mine.bus_sha256, driver=mine.driver)
 
@@ -311,7 +311,7 @@ def _difference(checked: Sequence[str], found: Sequence[str]) -> str:
 
 
 def subject_of(model: ArmModel, excitation: Excitation | None, described: ArmDescription | None) -> Subject:
-    """Return the subject that a ticket must have to allow this motion on this arm.
+    """Return the subject, names and hashes of arm, motion, model, drives and software, that a ticket must have.
 
     Args:
         model: of the arm.
@@ -340,7 +340,7 @@ def subject_of(model: ArmModel, excitation: Excitation | None, described: ArmDes
 
 
 def new_ticket(subject: Subject, checks: Sequence[Check], now_ns: int, valid: timedelta = VALID) -> Ticket:
-    """Create a ticket made now (`now_ns` since 1970 in UTC [ns]) that counts for `valid`."""
+    """Create a ticket made at `now_ns` [ns since 1970 in UTC] that expires after `valid`."""
     created = utc(now_ns)
     return Ticket(subject, tuple(checks), created, created + valid)
 
@@ -351,7 +351,7 @@ def utc(now_ns: int) -> datetime:
 
 
 def ticket_values(ticket: Ticket) -> dict[str, Any]:
-    """Return the ticket as JSON values."""
+    """Return the ticket as a dict of JSON values: verdict, times, subject and checks with their measures."""
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -373,7 +373,7 @@ def ticket_values(ticket: Ticket) -> dict[str, Any]:
 
 
 def read_ticket(path: Path) -> Ticket:
-    """Read a ticket's file.
+    """Read a ticket from its JSON file; raises UsageError where there is none or it is malformed.
 
     Raises:
         UsageError: no such file, or not a ticket; the message says what is wrong with it.

@@ -36,7 +36,7 @@ class Reference(Protocol):
         """Return the duration of the reference [s]."""
 
     def at(self, time: float) -> Setpoint:
-        """Return the setpoint at `time` [s] since the reference began."""
+        """Return the setpoint at `time` [s] since the reference began; after its duration the last one."""
 
 
 class PathReference:
@@ -47,7 +47,7 @@ class PathReference:
         self.duration = path.duration
 
     def at(self, time: float) -> Setpoint:
-        """Return the setpoint at `time` [s]."""
+        """Return the setpoint at `time` [s] since the path began; after its duration the last one."""
         position, velocity, acceleration = self._path.derivatives(np.asarray(min(time, self.duration), dtype=float), 2)
         return Setpoint(position, velocity, acceleration)
 
@@ -70,7 +70,7 @@ def rest(position: Vector) -> Setpoint:
 
 
 def hold(position: Vector, duration: float = inf) -> Hold:
-    """Return the reference of standing still at `position` [rad or m], shape (joints,), for `duration` [s]."""
+    """Create a reference that stands still at `position` [rad or m], (joints,), for `duration` [s], or for good."""
     return Hold(position, duration)
 
 
@@ -107,16 +107,16 @@ class RuckigReference:
         return ruckig.Ruckig(parameters.degrees_of_freedom).calculate(parameters, self._trajectory)
 
     def at(self, time: float) -> Setpoint:
-        """Return the setpoint at `time` [s]."""
+        """Return the setpoint at `time` [s] since the trajectory began; after its duration the last one."""
         position, velocity, acceleration = self._trajectory.at_time(min(time, self.duration))[:3]
         return Setpoint(np.array(position), np.array(velocity), np.array(acceleration))
 
     def extent(self) -> tuple[Vector, Vector]:
-        """Return the lowest and highest position, each of shape (joints,), sampled every `_EXTENT_STEP`."""
+        """Return the lowest and highest position at times sampled every `_EXTENT_STEP` [rad or m], (joints,) each."""
         return run_to_end(self.extent_in_slices())
 
     def extent_in_slices(self) -> Generator[None, None, tuple[Vector, Vector]]:
-        """Compute `extent` in slices short enough for a control cycle; the generator returns both positions."""
+        """Compute `extent` in slices for control cycles; the generator returns lowest and highest position."""
         # The position_extrema of ruckig itself miss turning points (pantor/ruckig#215), here by more than 0.1 rad.
         times = np.linspace(0.0, self.duration, 2 + int(self.duration / _EXTENT_STEP)).tolist()
         at_time = self._trajectory.at_time
@@ -133,12 +133,12 @@ _CALM = 0.5  # of the limits, on the way to a motion and back
 
 
 def plan_reduced_trajectory(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference:
-    """Plan a trajectory to a motion or back, within half of the velocity and acceleration limits where its ends allow.
+    """Plan a trajectory within half the velocity and acceleration limits, or more where its ends need it.
 
     A trajectory at the full limits leaves no margin for errors of the model, and a second more does not matter.
 
     Raises:
-        MotionRefused: as `way`.
+        MotionRefused: as `plan_trajectory`.
     """
     return run_to_end(plan_reduced_trajectory_in_slices(start, end, limits))
 
@@ -146,10 +146,10 @@ def plan_reduced_trajectory(start: Setpoint, end: Setpoint, limits: MotionLimits
 def plan_reduced_trajectory_in_slices(
     start: Setpoint, end: Setpoint, limits: MotionLimits
 ) -> Generator[None, None, RuckigReference]:
-    """Plan the same in slices short enough for a control cycle; the generator returns the trajectory.
+    """Plan as `plan_reduced_trajectory` in slices for control cycles; the generator returns the trajectory.
 
     Raises:
-        MotionRefused: as `way`, from any of its steps.
+        MotionRefused: as `plan_trajectory`, from any of its steps.
     """
     velocity = np.maximum(np.abs(start.velocity), np.abs(end.velocity))
     acceleration = np.maximum(np.abs(start.acceleration), np.abs(end.acceleration))
@@ -162,7 +162,7 @@ def plan_reduced_trajectory_in_slices(
 
 
 def plan_trajectory(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference:
-    """Plan a trajectory from one moving or resting state to another, all joints arriving together.
+    """Plan a trajectory between two states of motion, all joints arriving together; MotionRefused outside limits.
 
     Raises:
         MotionRefused: no such way exists within the limits, or it would leave the position limits.
@@ -173,10 +173,10 @@ def plan_trajectory(start: Setpoint, end: Setpoint, limits: MotionLimits) -> Ruc
 def plan_trajectory_in_slices(
     start: Setpoint, end: Setpoint, limits: MotionLimits
 ) -> Generator[None, None, RuckigReference]:
-    """Plan as `way` does, in slices short enough for a control cycle; the generator returns the trajectory.
+    """Plan as `plan_trajectory` in slices for control cycles; the generator returns the trajectory.
 
     Raises:
-        MotionRefused: as `way`, from any of its steps.
+        MotionRefused: as `plan_trajectory`, from any of its steps.
     """
     parameters = ruckig.InputParameter(len(start.position))
     parameters.current_position = start.position.tolist()

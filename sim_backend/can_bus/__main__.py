@@ -12,7 +12,7 @@ from sim_backend.can_bus.hub import CanBusServer
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Host a wire until interrupted; returns 0 when it was ended, 1 when it could not begin."""
+    """Host a simulated CAN bus until interrupted; return 0 when it was ended, 1 when it could not begin."""
     parser = argparse.ArgumentParser(prog="python -m sim_backend.can_bus", description=__doc__)
     parser.add_argument("name", help="what ends connect to: a name, or the path of a socket file")
     parser.add_argument("--bitrate", type=int, default=0, help="pace to keep [bit/s]; 0: none")

@@ -73,7 +73,7 @@ class IdentWireBus(can.BusABC):
         super().__init__(channel=channel, can_filters=can_filters, **kwargs)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send a message at once; a wire that takes no more is an error, whatever the timeout.
+        """Send a message at once; CanOperationError where the simulated bus takes no more, whatever the timeout.
 
         Raises:
             can.CanOperationError: the wire is gone, or takes no more.
@@ -117,7 +117,7 @@ class IdentWireBus(can.BusABC):
         return self._connection.fileno()
 
     def shutdown(self) -> None:
-        """Leave the wire, and end it if it is hosted here."""
+        """Disconnect from the simulated bus, and end the bus if it is hosted here."""
         super().shutdown()
         self._connection.close()
         if self._thread is not None:

@@ -99,7 +99,7 @@ class LocalPort:
         return frames
 
     def close(self) -> None:
-        """Remove the port from the wire, which goes on."""
+        """Remove the port from the simulated bus, which goes on."""
         self._wire.medium.remove(self.port)
 
 
@@ -127,7 +127,7 @@ class WireThread:
         self.close()
 
     def close(self) -> None:
-        """Close the wire and all its connections; any number of times."""
+        """Close the simulated bus and all its connections, and end its thread; any number of times."""
         self._ended = True
         self.wire.wake()
         if self._thread.is_alive():

@@ -101,7 +101,7 @@ class CanBusServer:
         self.close()
 
     def close(self) -> None:
-        """Close the wire and all its connections; any number of times."""
+        """Close the simulated bus and all its connections; any number of times."""
         with self.lock:
             if self._listener is None:
                 return
@@ -112,12 +112,12 @@ class CanBusServer:
             os.close(self._wake)
 
     def wake(self) -> None:
-        """Let a `poll` that waits in another thread return."""
+        """Make a `poll` that waits in another thread return."""
         with suppress(OSError):
             os.eventfd_write(self._wake, 1)
 
     def poll(self, deadline_ns: int) -> None:
-        """Receive from sockets, move frames, and deliver received ones; once.
+        """Wait until the deadline for something to do, then read sockets, move frames and deliver them, once.
 
         Args:
             deadline_ns: how long to wait for something to do [ns, monotonic]; one in the past only looks.
@@ -145,7 +145,7 @@ class CanBusServer:
             self.turn(time.monotonic_ns())
 
     def watched(self) -> tuple[list[int], int | None]:
-        """Return the descriptors to wait for, and when a frame ends, where one loop hosts several wires."""
+        """Return the descriptors to wait for, and when the frame under way ends [ns], None while there is none."""
         with self.lock:
             if self._listener is None:
                 return [], None
@@ -158,7 +158,7 @@ class CanBusServer:
             return [self._listener.fileno(), self._wake, *ends], self.medium.end_ns
 
     def turn(self, now_ns: int) -> None:
-        """Move frames and deliver received ones, without taking anything from a socket."""
+        """Advance the simulated bus to `now_ns` and deliver received frames, without reading any socket."""
         self.medium.advance(now_ns)
         for end in list(self._ends.values()):
             if end.port is not None and end.port.inbox:

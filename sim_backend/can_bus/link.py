@@ -42,7 +42,7 @@ _MAX_ADDRESS = 100
 
 
 def address_of(channel: str) -> str:
-    """Return the socket address of a channel.
+    """Return the socket address of a simulated bus: `channel` if it is a path, else an abstract one of this user.
 
     Raises:
         BusError: a channel that cannot be one.
@@ -54,7 +54,7 @@ def address_of(channel: str) -> str:
 
 
 def listen(channel: str) -> socket.socket:
-    """Open the socket of a wire that takes connections.
+    """Open and return the listening socket of a simulated bus; BusError where another process hosts that bus.
 
     Raises:
         BusError: another process runs this wire, or the address cannot be had.
@@ -82,7 +82,7 @@ def listen(channel: str) -> socket.socket:
 
 
 def connect(channel: str) -> socket.socket:
-    """Connect to the wire.
+    """Connect to a simulated bus and return the socket; BusError if nobody hosts it, or another user does.
 
     Raises:
         BusError: no process runs it, or one of another user does.
@@ -118,7 +118,7 @@ def peer_pid(sock: socket.socket) -> int:
 
 
 def forget(channel: str, sock: socket.socket) -> None:
-    """Close a listening socket, and remove its file."""
+    """Close the listening socket of a simulated bus, and remove its file where `channel` is a path."""
     sock.close()
     if "/" in channel:
         with suppress(OSError):
@@ -152,7 +152,7 @@ _ANSWERS = {
 
 
 def from_config(config: ArmConfig, bus_number: int) -> WireLink:
-    """Open the link of one bus of an arm; entry point `ident_wire`.
+    """Open and return the link of one simulated bus of an arm; entry point `ident_wire`.
 
     Raises:
         BusError: no process runs the wire, or it refuses.
@@ -204,7 +204,7 @@ class Connection:
         return self._socket.fileno()
 
     def send(self, frames: Sequence[Frame]) -> None:
-        """Send frames in their order, in one packet for each 64, stamped with now: a wire's host may be late itself.
+        """Send frames in their order, 64 at most a packet, stamped with now; BusError where the bus takes no more.
 
         Raises:
             BusError: the wire is gone, or takes no more.
@@ -218,7 +218,7 @@ class Connection:
             raise self._failure(error) from None
 
     def take(self, until_ns: int = 0) -> list[tuple[Frame, bool]]:
-        """Return the frames of the next packet, with whether they are this end's own; empty from `until_ns` on.
+        """Return the frames of the next packet, each with whether this end sent it; empty if none by `until_ns`.
 
         Raises:
             BusError: the wire is gone.
@@ -239,7 +239,7 @@ class Connection:
             return unpack_frames(data)
 
     def close(self) -> None:
-        """Close the connection to the wire."""
+        """Close the connection to the simulated bus."""
         self._socket.close()
 
     def _wait(self, seconds: float) -> None:
@@ -273,7 +273,7 @@ class WireLink:
         self._watch = BusOffWatch()
 
     def send(self, frame: Frame) -> None:
-        """Send one frame to the wire.
+        """Send one frame to the simulated bus; BusError where that is gone or takes no more.
 
         Raises:
             BusError: bus-off, the wire is gone or takes no more.
@@ -282,7 +282,7 @@ class WireLink:
         self.send_all((frame,))
 
     def send_all(self, frames: Sequence[Frame]) -> None:
-        """Send several frames in one system call, in their order; raises as `send` does, and then nothing is sent."""
+        """Send frames in their order, 64 to a system call; a frame that cannot exist raises before any is sent."""
         for frame in frames:
             check_sendable(frame, fd=self._fd)
         if self._watch.off:
@@ -315,7 +315,7 @@ class WireLink:
         return frames
 
     def close(self) -> None:
-        """Close the connection to the wire."""
+        """Close the connection to the simulated bus."""
         self._connection.close()
 
     def _keep(self, taken: list[tuple[Frame, bool]]) -> None:

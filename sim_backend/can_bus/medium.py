@@ -53,24 +53,24 @@ class ErrorCounters:
         self.state: State = "active"
 
     def set(self, sending: int, receiving: int, stamp_ns: int) -> Frame | None:
-        """Set both counters; returns the error frame when the state changes."""
+        """Set both counters; return an error frame if the controller's state changes, else None."""
         self.sending, self.receiving = min(max(sending, 0), _OFF), min(max(receiving, 0), _OFF)
         return self._change(stamp_ns)
 
     def send_error(self, stamp_ns: int) -> Frame | None:
-        """Count a destroyed frame of this controller."""
+        """Add 8 send errors, for its own frame destroyed; return an error frame if the state changes, else None."""
         return self.set(self.sending + 8, self.receiving, stamp_ns)
 
     def receive_error(self, stamp_ns: int) -> Frame | None:
-        """Count a destroyed frame of another controller."""
+        """Add 1 receive error, for another's frame destroyed; return an error frame if the state changes, else None."""
         return self.set(self.sending, self.receiving + 1, stamp_ns)
 
     def sent(self, stamp_ns: int) -> Frame | None:
-        """Count a frame sent without error."""
+        """Lower the send errors by 1 for a frame sent; return an error frame if the state changes, else None."""
         return self.set(self.sending - 1, self.receiving, stamp_ns) if self.sending else None
 
     def received(self, stamp_ns: int) -> Frame | None:
-        """Count a frame received without error."""
+        """Lower the receive errors for a frame received; return an error frame if the state changes, else None."""
         return self.set(self.sending, min(self.receiving - 1, _PASSIVE_SUCCESS), stamp_ns) if self.receiving else None
 
     def restart(self, stamp_ns: int) -> Frame:
@@ -211,11 +211,11 @@ class Medium:
 
     @property
     def end_ns(self) -> int | None:
-        """Return when the frame that is being sent ends, None while the wire is free."""
+        """Return when the frame that is being sent ends [ns], None while the bus is free."""
         return None if self._current is None else self._current[2]
 
     def add(self, port: BusEndpoint) -> None:
-        """Add a port to the wire."""
+        """Add a port, a controller, to the simulated bus."""
         self.ports.append(port)
 
     def remove(self, port: BusEndpoint) -> None:
@@ -232,7 +232,7 @@ class Medium:
         return QUEUE - len(port.pending)
 
     def offer(self, port: BusEndpoint, frame: Frame, now_ns: int) -> bool:
-        """Queue a frame; False when the queue is full. A controller that is off the bus sends nothing, silently."""
+        """Queue a frame; return False where the queue is full; a controller that is off drops it and returns True."""
         if port.counters.state == "off":
             return True
         if len(port.pending) >= QUEUE:
@@ -252,7 +252,7 @@ class Medium:
             self._finish(port, frame, end)
 
     def destroy(self, count: int, port: BusEndpoint | None = None) -> None:
-        """Destroy the next `count` frames, of one port or of any, by an error; they are sent again."""
+        """Have the next `count` frames, of one port or of any, destroyed by an error; their senders repeat them."""
         self._to_destroy[port] = count
 
     def set_counters(self, port: BusEndpoint, sending: int, receiving: int, now_ns: int) -> None:
@@ -260,7 +260,7 @@ class Medium:
         self._note(port, port.counters.set(sending, receiving, now_ns))
 
     def restart(self, port: BusEndpoint, now_ns: int) -> None:
-        """Return a controller to the bus."""
+        """Return a controller to the bus with its error counters at 0, and tell it so by an error frame."""
         self._note(port, port.counters.restart(now_ns))
 
     def _start(self, now_ns: int) -> bool:

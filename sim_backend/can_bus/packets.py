@@ -46,7 +46,7 @@ class Welcome:
 
 
 def pack_hello(hello: Hello) -> bytes:
-    """Encode the first packet of an end; the label is cut to 32 bytes."""
+    """Encode the greeting that an end sends first; the label is cut to 32 bytes."""
     if len(hello.filters) > _MAX_FILTERS:
         raise DriverError(f"{len(hello.filters)} filters, at most {_MAX_FILTERS}")
     label = hello.label.encode()[:32].decode(errors="ignore").encode()
@@ -56,7 +56,7 @@ def pack_hello(hello: Hello) -> bytes:
 
 
 def unpack_hello(data: bytes) -> Hello:
-    """Decode the first packet of an end.
+    """Decode the greeting that an end sends first; raises DriverError where it is none.
 
     Raises:
         DriverError: it is no greeting, or of another version.
@@ -73,12 +73,12 @@ def unpack_hello(data: bytes) -> Hello:
 
 
 def pack_welcome(welcome: Welcome) -> bytes:
-    """Encode the answer of a wire."""
+    """Encode the welcome with which a simulated bus answers a greeting."""
     return _WELCOME.pack(MAGIC, VERSION, welcome.answer, welcome.fd, welcome.bitrate, welcome.data_bitrate)
 
 
 def unpack_welcome(data: bytes) -> Welcome:
-    """Decode the answer of a wire.
+    """Decode the welcome of a simulated bus; one of another version has the answer `OTHER_VERSION`.
 
     Raises:
         DriverError: it is no such answer.

@@ -74,7 +74,7 @@ class VendorWatchdogs:
         self._node.stop(_TARGET)
 
     def due(self, name: str) -> None:
-        """Handle the due timer of this name."""
+        """Report a missing SYNC or target as an error if its timer is the one that ran out; ignore others."""
         if name in (_SYNC, _TARGET):
             self._emergency.occurs(NO_SYNC if name == _SYNC else NO_TARGET)
             self._late()
@@ -111,11 +111,11 @@ class PositionLoop:
         self._integral, self._last_ns = 0.0, 0
 
     def release(self) -> None:
-        """Open the loop; it closes again where the motor is then."""
+        """Open the position loop; it starts again from where the motor is then."""
         self._line, self._integral = None, 0.0
 
     def torque(self, now_ns: int, most: float) -> float:
-        """Return the torque that the loop asks for [N m at the motor]; beyond `most` the integral part stands still."""
+        """Return the torque that the loop asks for [N m at the motor]; above `most` the integral part is frozen."""
         goal, per_radian = self._objects.number(0x607A), self._motor.counts_per_turn / (2.0 * math.pi)
         actual = self._motor.encoder(now_ns)
         if self._line is None:
@@ -158,14 +158,14 @@ class TorqueLoop:
         self.limited = self.follows = False
 
     def release(self) -> None:
-        """End the torque loop; the power stage decides what the motor does now."""
+        """End the torque loop and set its reported torques to 0; the power stage decides what the motor does now."""
         self.limited = self.follows = self._motor.holds = False
         self._position.release()
         for index in (0x6074, 0x6077, 0x6078):
             self._objects.values[index << 8] = 0
 
     def evaluate(self, now_ns: int) -> None:
-        """Make the motor give the torque that is asked for, as far as limits let it."""
+        """Limit the torque that is asked for, make the motor give it, and set the entries that report it."""
         number = self._objects.number
         values = self._objects.values
         cyclic = number(0x6061) in self._personality.modes
@@ -195,7 +195,7 @@ class TorqueLoop:
         self._acting = acts, now_ns
 
     def tell_mean(self, now_ns: int) -> None:
-        """Report the mean torque since the last report: a position loop changes it several times in a cycle."""
+        """Report the mean torque since the last report, where a position loop holds the motor."""
         if not self._motor.holds:
             return
         self._add(self._acting[0], now_ns)
@@ -292,17 +292,17 @@ class PowerStage:
         self.voltage = True
 
     def start(self) -> None:
-        """End the self-test (transitions 0 and 1)."""
+        """Enter `switch on disabled`, as the self-test has ended (transitions 0 and 1)."""
         self._word = 0
         self.state = PowerState.SWITCH_ON_DISABLED
 
     def down(self) -> None:
-        """Stop the firmware."""
+        """Enter `not ready to switch on`, as when the firmware stops."""
         self._node.stop(_RAMP)
         self.state = PowerState.NOT_READY
 
     def control(self, word: int) -> bool:
-        """Process a controlword; returns whether it resets a fault."""
+        """Process a controlword; return True only where it resets a fault: a rising bit 7 in the state `fault`."""
         before, self._word = self._word, word
         rising = bool(word & _RESET and not before & _RESET)
         if self.state is PowerState.FAULT:
@@ -324,7 +324,7 @@ class PowerStage:
         self.state = PowerState.SWITCH_ON_DISABLED
 
     def disable_voltage(self) -> None:
-        """Do what the command disable voltage does."""
+        """Make the transition of the command disable voltage, if the present state has one."""
         if (target := TRANSITIONS.get((self.state, Command.DISABLE_VOLTAGE))) is not None:
             self._to(target)
 
@@ -365,7 +365,7 @@ class PowerStage:
                 self.state = PowerState.FAULT if faulty else PowerState.SWITCH_ON_DISABLED
 
     def due(self, name: str) -> None:
-        """Handle the due timer of this name."""
+        """Go on with braking, or end it, if the timer that ran out is that of the ramp; ignore others."""
         if name != _RAMP:
             return
         now = self._node.now_ns
@@ -509,14 +509,11 @@ class CanopenDrive:
         self.nmt.boot(0)
 
     def receive(self, frame: Frame, now_ns: int) -> list[Frame]:
-        """Process a frame of another node.
+        """Process a frame of another node; return the frames that the drive sends, in order.
 
         Args:
             frame: frame of any kind; one that is not for this drive does nothing.
             now_ns: present time [ns], not before that of the last call.
-
-        Returns:
-            What the drive sends, in order.
         """
         if frame.error or frame.extended:
             return []
@@ -546,7 +543,7 @@ class CanopenDrive:
         return self._finish()
 
     def finish_sync(self, now_ns: int) -> list[Frame]:
-        """Let the received torques act, after a SYNC that `receive` has answered; returns what the drive sends."""
+        """Apply the received torques, after a SYNC that `receive` has answered; return the frames that follow."""
         self._node.now_ns = now_ns
         if self._synced:
             self._synced = self._evaluated = False
@@ -574,7 +571,7 @@ class CanopenDrive:
         return self._finish()
 
     def watch(self, now_ns: int) -> None:
-        """Sample position and speed between frames, as a drive does all the time."""
+        """Sample position and speed between frames, and limit the torque by them, while operation is enabled."""
         if self.power.state is PowerState.OPERATION_ENABLED:
             self._sample(now_ns)
             self._torque.evaluate(now_ns)
@@ -595,7 +592,7 @@ class CanopenDrive:
         return Traffic.OTHER
 
     def fail(self, code: int, now_ns: int, *, lasting: bool = False) -> list[Frame]:
-        """Simulate a fault that the drive finds in itself.
+        """Simulate a fault that the drive finds in itself; return the frames that it sends.
 
         Args:
             code: code of the emergency message, which is also in 603Fh.
@@ -619,13 +616,13 @@ class CanopenDrive:
         self.deaf = deaf
 
     def warn(self, warned: bool, now_ns: int) -> list[Frame]:
-        """Set or clear the warning bit of the statusword."""
+        """Set or clear the warning bit of the statusword; return the frames that the drive sends."""
         self._node.now_ns = now_ns
         self._warned = warned
         return self._finish()
 
     def supply(self, on: bool, now_ns: int) -> list[Frame]:
-        """Switch the power of the motor, not of the firmware, on or off."""
+        """Switch the motor's power, not the firmware's, on or off; return the frames that the drive sends."""
         self._node.now_ns = now_ns
         self.power.supply(on)
         if on:
@@ -635,13 +632,13 @@ class CanopenDrive:
         return self._finish()
 
     def reboot(self, now_ns: int) -> list[Frame]:
-        """Restart the firmware by itself, as after a brown-out."""
+        """Restart the firmware by itself, as after a brown-out; return the frames that the drive sends."""
         self._node.now_ns = now_ns
         self.nmt.reset(nmt.Command.RESET_NODE)
         return self._finish()
 
     def evaluate(self, now_ns: int) -> None:
-        """Evaluate position, speed and torque anew after a defect has changed."""
+        """Evaluate position, speed and torque again, after a defect has changed."""
         self.watch(now_ns)
 
     # Called by the parts of the drive.

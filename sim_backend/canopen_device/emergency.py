@@ -60,7 +60,7 @@ class Emergency:
             self._tell(0)
 
     def due(self, name: str) -> None:
-        """Handle the due timer of this name."""
+        """Send the next waiting emergency if the timer that ran out is that of the inhibit time; ignore others."""
         if name == _INHIBIT and self._waiting:
             self._transmit(self._waiting.pop(0))
 

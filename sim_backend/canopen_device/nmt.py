@@ -101,12 +101,12 @@ class Nmt:
             self._to(_TARGETS[Command(data[0])])
 
     def reset(self, command: Command) -> None:
-        """Restart the whole node, or its communication."""
+        """Restart the whole node, or its communication, by the command; boot-up follows after its delay."""
         self._reset(command)
         self.boot(self._boot_ns)
 
     def leave_operational(self) -> None:
-        """Leave `operational` after a communication error, where object 1029h:01 does not say otherwise."""
+        """Enter pre-operational after a communication error; the caller has checked object 1029h:01."""
         self.commanded = False
         self._to(State.PRE_OPERATIONAL)
 
@@ -144,7 +144,7 @@ class Nmt:
                 self._found(_HOST)
 
     def heard(self, frame: Frame) -> None:
-        """Process a heartbeat of another node."""
+        """Process a heartbeat of another node: if it is awaited, start to wait for the next, and end its absence."""
         number = frame.identifier - 0x700
         for subindex in _CONSUMERS:
             entry = self._node.objects.number(0x1016, subindex)
@@ -155,7 +155,7 @@ class Nmt:
                     self._found(number)
 
     def due(self, name: str) -> None:
-        """Handle the due timer of this name."""
+        """Act on the timer that ran out: send boot-up or heartbeat, or note that a guard or heartbeat is missing."""
         if name == _BOOT:
             self._node.send(0x700 + self._node.number, b"\0")
             self._to(State.PRE_OPERATIONAL)

@@ -32,9 +32,9 @@ class Node:
         self.out.append(Frame(identifier, data))
 
     def after(self, name: str, delay_ns: int) -> None:
-        """Set a timer."""
+        """Set the timer of this name to run out `delay_ns` from now; a running one starts again."""
         self.timers[name] = self.now_ns + delay_ns
 
     def stop(self, name: str) -> None:
-        """Stop a timer; does nothing when it does not run."""
+        """Stop the timer of this name; do nothing when it does not run."""
         self.timers.pop(name, None)

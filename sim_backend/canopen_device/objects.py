@@ -123,13 +123,13 @@ class Objects:
                 self.values[key] = entry.default
 
     def store(self) -> None:
-        """Keep what a host can write, and is no command, over resets."""
+        """Make the present values of what a host can write, but for commands, the values after a reset."""
         for key, entry in self.entries.items():
             if entry.writable and key >> 8 not in _NOT_STORED:
                 self.entries[key] = replace(entry, default=self.values[key])
 
     def restore(self) -> None:
-        """Take the values after power-up from the data sheet again, from the next reset on."""
+        """Make the data sheet's values those after a reset again; present values stay until then."""
         self.entries.update(self._factory)
 
     def number(self, index: int, subindex: int = 0) -> int:
@@ -146,7 +146,7 @@ class Objects:
         self.values[key] = _cut(entry.form, value)
 
     def read(self, index: int, subindex: int) -> bytes:
-        """Return the bytes that a host's upload gets; raises SdoAbort."""
+        """Return the bytes of a value for a host's upload; SdoAbort where there is none, or it is not readable."""
         key = index << 8 | subindex
         entry = self._entry(index, subindex)
         if not entry.readable:
@@ -258,7 +258,7 @@ class SdoServer:
         self.reset()
 
     def reset(self) -> None:
-        """Discard a transfer that has begun."""
+        """Discard a transfer that is under way."""
         self._multiplexer = (0, 0)
         self._upload: bytes | None = None
         self._download: bytearray | None = None

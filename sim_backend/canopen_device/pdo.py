@@ -58,7 +58,7 @@ class Layout:
 
 
 def layout(objects: Objects, index: int, count: int | None = None) -> Layout:
-    """Derive the layout from a mapping parameter.
+    """Return the layout of a PDO, packing and entries, by its mapping parameter.
 
     Args:
         objects: object dictionary that holds the mapping.
@@ -91,7 +91,7 @@ def layout(objects: Objects, index: int, count: int | None = None) -> Layout:
 
 
 def check_write(objects: Objects, key: int, value: int) -> None:
-    """Check whether a host may write this value into a PDO parameter now; raises SdoAbort where not.
+    """Raise SdoAbort where a host may not write this value into a PDO parameter now.
 
     A PDO's identifier and mapping only change while it does not exist (bit 31), entries only while there are none.
     Where the identifier is fixed, the number of entries alone says whether it exists.
@@ -281,7 +281,7 @@ class Pdos:
                 self._node.send(tpdo.identifier, data)
 
     def act(self) -> None:
-        """Let what synchronous RPDOs have brought since the last SYNC act."""
+        """Apply what synchronous RPDOs have received since the last SYNC."""
         for group in self.rpdos.values():
             for rpdo in group:
                 if rpdo.waiting is not None:
@@ -299,7 +299,7 @@ class Pdos:
                     self._event(tpdo, data)
 
     def due(self, name: str) -> None:
-        """Handle the due timer of this name; inhibited TPDOs are sent with the next `changes`."""
+        """Act on the timer that ran out: an RPDO's deadline, a TPDO's event; inhibited ones go out by `changes`."""
         if name.startswith(_DEADLINE):
             self._emergency.occurs(RPDO_TIMEOUT)
             self._late()

@@ -67,7 +67,7 @@ class DriveProperties:
     mode_when_on: bool = False
 
     def reach(self, objects: Objects) -> int:
-        """Return the largest torque that the drive's limits let through [counts]."""
+        """Return the largest torque that all limits of the drive let through, the smallest of them [counts]."""
         found = [0x7FFF]
         for key, per, below in self.limits:
             if key in objects.entries:
@@ -78,14 +78,14 @@ class DriveProperties:
         return min(found)
 
     def target_torque(self, objects: Objects) -> int:
-        """Return the target torque [counts]; none while the drive does not follow it."""
+        """Return the target torque [counts]; 0 while the drive does not follow it."""
         follows = objects.number(0x6040) & self.enabling == self.enabling
         if not follows or any(objects.number(key >> 8, key & 0xFF) != value for key, value in self.needs):
             return 0
         return objects.number(self.target >> 8, self.target & 0xFF) >> self.shift
 
     def fastest(self, objects: Objects) -> float | None:
-        """Return the speed above which no torque acts that leads faster [turns per minute]; None for none."""
+        """Return the speed limit above which no accelerating torque acts [turns per minute]; None without one."""
         if self.speed is None or self.speed[0] not in objects.entries:
             return None
         key, size = self.speed
@@ -103,14 +103,14 @@ _SHIPPED = {1: 0, 2: 1}  # vendor and product that `configs/emulated_drive.eds` 
 
 
 def described_personality(text: str, drive: CanopenDrive, families: Sequence[Family] = ()) -> DriveProperties:
-    """Return `LIKE_NEW` for the shipped data sheet, else as `personality_of`."""
+    """Return `LIKE_NEW` for the shipped data sheet, else the properties that `personality_of` derives."""
     told = data_sheet(text).identity
     shipped = all(told.get(sub) == value for sub, value in _SHIPPED.items())
     return LIKE_NEW if shipped else personality_of(text, drive, families)
 
 
 def personality_of(text: str, drive: CanopenDrive, families: Sequence[Family] = ()) -> DriveProperties:
-    """Derive the properties of a drive from a maker's file, with the motor of a description.
+    """Derive a drive's properties from its maker's EDS or DCF, with the motor of a description.
 
     Args:
         text: of the EDS or DCF.
@@ -174,7 +174,7 @@ class Firmware:
         self._node, self._personality, self._control = node, personality, control
 
     def arrived(self, keys: tuple[int, ...]) -> None:
-        """Note that frames have set these entries."""
+        """Apply a mode or control word among these entries just written: at once in the shipped drive, else delayed."""
         for key, name, delay in ((0x606000, _MODE, _MODE_NS), (0x604000, _CONTROL, _LOOP_NS)):
             if key in keys and self._personality.shipped:
                 self.due(name)
@@ -182,7 +182,7 @@ class Firmware:
                 self._node.after(name, delay)
 
     def due(self, name: str) -> None:
-        """Handle the due timer of this name."""
+        """Let a control word or mode take effect if the timer that ran out is its delay; ignore others."""
         number = self._node.objects.number
         if name == _CONTROL:
             self._control(number(0x6040))

@@ -156,13 +156,13 @@ class Body:
         self._drawn_ns = now_ns - self._period_ns
 
     def angle(self, motor: int, now_ns: int) -> float:
-        """Return the angle of a motor [rad]."""
+        """Advance the plant to this time, and return the angle of a motor [rad]."""
         self.advance(now_ns)
         self._look()
         return self._angles[motor] + self._speeds[motor] * (now_ns - self.now_ns) * 1e-9
 
     def speed(self, motor: int, now_ns: int) -> float:
-        """Return the speed of a motor [rad/s]."""
+        """Advance the plant to this time, and return the speed of a motor [rad/s]."""
         self.advance(now_ns)
         self._look()
         return self._speeds[motor]
@@ -189,7 +189,7 @@ class Body:
                 self.watch(end)
 
     def support(self, now_ns: int) -> None:
-        """Support the arm where it stands, until all motors are powered and given torque again."""
+        """Hold the arm where it stands, at rest, until all motors are powered and given torque again."""
         if not self.supported:
             self.advance(now_ns)
             self.plant.rest()
@@ -212,7 +212,7 @@ class Body:
         self.plant.place(position)
 
     def catch_up(self, now_ns: int) -> None:
-        """Move the plant after a silence of more than a step, before what ends the silence has any effect."""
+        """Advance the plant to this time only if it lags by more than a step, before a frame takes effect."""
         if now_ns - self.now_ns > _LONGEST * self._period_ns:
             self.advance(now_ns)
 

@@ -82,12 +82,12 @@ class Emulator:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Return what each of `states` is the state of, in words."""
+        """Return a label for each entry of `states`: a drive's name and node number, or the safety node."""
         drives = (f"{name}, node {face.number}" for name, face in zip(self.names, self.faces, strict=True))
         return (*drives, *(f"safety, node {companion.number}" for companion in self.companions))
 
     def is_feedback(self, sent: Sent) -> bool:
-        """Return whether a frame on its way is a drive's position in a cycle."""
+        """Return whether a frame that is being sent is a drive's position feedback."""
         return sent.drive is not None and self.faces[sent.drive].traffic_kind(sent.frame) is Traffic.FEEDBACK
 
     @property
@@ -129,7 +129,7 @@ class Emulator:
         sender: int | None = None,
         answer: Callable[[list[Sent]], object] | None = None,
     ) -> list[Sent]:
-        """Process a frame that has come over a bus.
+        """Deliver a frame on a bus to all drives that listen to it; return the frames that they send, in order.
 
         Args:
             bus: index of the bus.
@@ -174,7 +174,7 @@ class Emulator:
         return sent
 
     def tick(self, now_ns: int) -> list[Sent]:
-        """Process everything that is due: faults begin and end, drives act on their timers, in order of time.
+        """Process faults and timers that are due until `now_ns`, in order of time; return the frames that are sent.
 
         Raises:
             DriverError: the plant ran away.
@@ -205,7 +205,7 @@ class Emulator:
         self._deadline = None
 
     def go_on(self, now_ns: int) -> None:
-        """Compute the arm's next step before its cycle; take it when the cycle is late, by `Body.overdue_ns`.
+        """Compute the arm's next step in advance; take it at once where its cycle is late, by `Body.overdue_ns`.
 
         Moving the arm takes longest; without this the answers to each cycle would come later, and late ones late.
         """
@@ -219,7 +219,7 @@ class Emulator:
             self._deadline = None
 
     def inject(self, faults: Iterable[DriveFault], now_ns: int) -> None:
-        """Schedule faults, counted from now on; they take effect with `tick`."""
+        """Schedule faults, counted from now on, which take effect with `tick`; DriverError for an unknown drive."""
         for fault in faults:
             if fault.drive is not None and not 0 <= fault.drive < len(self.faces):
                 raise DriverError(f"{fault} is of no drive")
@@ -232,7 +232,7 @@ class Emulator:
         self._configured += tuple(faults)
 
     def clear(self, now_ns: int) -> None:
-        """End all faults that act, and drop those that have not begun yet."""
+        """End all faults that act, with the next `tick`, and drop those that have not begun yet."""
         self._to_begin.clear()
         self._to_end = [(now_ns, fault) for fault in self._injection.active]
         self._deadline = None

@@ -39,10 +39,10 @@ class BusDevice(Protocol):
         """Start the firmware."""
 
     def receive(self, frame: Frame, now_ns: int) -> list[Frame]:
-        """Process a frame of another node; of a SYNC, what its answer needs."""
+        """Process a frame of another node and return the frames that follow; of a SYNC, only the answer to it."""
 
     def tick(self, now_ns: int) -> list[Frame]:
-        """Process the timers that are due."""
+        """Process the timers that are due, and return the frames to send."""
 
     def listens(self, identifier: int) -> bool:
         """Return whether a frame of this identifier means anything to the device."""
@@ -69,31 +69,31 @@ class EmulatedDevice(BusDevice, Protocol):
         """Return the identifier of the frames with which the host begins a cycle."""
 
     def finish_sync(self, now_ns: int) -> list[Frame]:
-        """Do what else a SYNC asks for, when its answer is on its way; called after each `receive` of one."""
+        """Do the rest of a SYNC after `receive` has answered it, and return the frames to send."""
 
     def watch(self, now_ns: int) -> None:
-        """Limit the torque by position and speed of the motor, during a longer silence."""
+        """Sample the motor's position and speed during a long silence, and limit the torque by them."""
 
     def traffic_kind(self, frame: Frame) -> Traffic:
-        """Return the kind of a frame that the drive has sent."""
+        """Return whether a frame that the drive has sent is position feedback, a heartbeat or another."""
 
     def evaluate(self, now_ns: int) -> None:
-        """Evaluate the motor anew after one of its defects has changed."""
+        """Evaluate the motor's torque and power again, after one of its defects has changed."""
 
     def fail(self, code: int, now_ns: int, *, lasting: bool = False) -> list[Frame]:
-        """Begin a fault with this error code; a lasting one is of the power stage and stays until `repaired`."""
+        """Begin a fault with this error code, lasting until `repaired` or not; return the frames to send."""
 
     def repaired(self) -> None:
-        """End a lasting fault."""
+        """End a lasting fault's cause; the fault itself may still have to be reset."""
 
     def ignore_watchdogs(self, deaf: bool) -> None:
         """Set whether the drive goes on although its host is gone."""
 
     def warn(self, warned: bool, now_ns: int) -> list[Frame]:
-        """Set or clear a warning."""
+        """Set or clear a warning of the drive, and return the frames to send."""
 
     def supply(self, on: bool, now_ns: int) -> list[Frame]:
-        """Switch the motors' power on or off (emergency stop)."""
+        """Switch the motors' power on or off, as an emergency stop does, and return the frames to send."""
 
     def reboot(self, now_ns: int) -> list[Frame]:
-        """Restart the firmware by itself."""
+        """Restart the firmware by itself, and return the frames to send."""

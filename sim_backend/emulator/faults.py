@@ -78,7 +78,7 @@ class DriveFault:
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def window(self, start_ns: int, period_ns: int) -> tuple[int, int | None]:
-        """Return the first and last moment of the fault [ns]; None where it stays.
+        """Return when the fault begins and when it ends [ns]; the end is None where it stays.
 
         Args:
             start_ns: moment that `at` counts from.
@@ -91,7 +91,7 @@ class DriveFault:
 
 
 def configured(faults: Sequence[SimulatedFault], names: Sequence[str], period: float) -> tuple[DriveFault, ...]:
-    """Convert the faults of a configuration.
+    """Convert a configuration's faults to drive faults; DriverError for an unknown joint or an unsuitable kind.
 
     Args:
         faults: faults of the section `driver.emulation`.
@@ -234,11 +234,11 @@ class Injection:
 
     @property
     def cut_off(self) -> bool:
-        """Return whether no frame gets through."""
+        """Return whether a fault acts by which no frame of any drive gets through."""
         return any(fault.kind in _CUT_OFF for fault in self.active)
 
     def dead(self, drive: int) -> bool:
-        """Return whether a node neither receives nor sends anything."""
+        """Return whether a fault has silenced this drive: it neither receives nor sends anything."""
         return drive in self._dead
 
     def begin(self, fault: DriveFault, now_ns: int) -> list[Sent]:

@@ -43,11 +43,11 @@ class LockStepBus:
         self._found: tuple[int, tuple[int, int, Sent]] | None = None  # the next frame, while it is known
 
     def as_sent(self, frame: Frame) -> Frame:
-        """Return a frame as it is on this bus."""
+        """Return the frame, marked as CAN FD where this bus is CAN FD and it is a data frame."""
         return frame._replace(fd=True) if self.fd and not (frame.remote or frame.error) else frame
 
     def duration_ns(self, frame: Frame) -> int:
-        """Return the duration of a frame [ns]."""
+        """Return the duration of a frame on this bus, without stuff bits [ns]."""
         # A length that only CAN FD has takes its bits on any bus: tests send such frames, no controller does.
         kind = len(frame.data), len(frame.data) > _CLASSIC or (self.fd and not (frame.remote or frame.error))
         if (known := self._durations.get(kind)) is None:
@@ -56,24 +56,24 @@ class LockStepBus:
         return known
 
     def occupy(self, now_ns: int, frame: Frame) -> None:
-        """Occupy the wire by a frame of the host as soon as it is free."""
+        """Occupy the bus by a frame of the host for its duration, from when the bus is free."""
         self._free_ns = max(self._free_ns, now_ns) + self.duration_ns(frame)
         self._found = None
 
     def put(self, sent: Sent) -> None:
-        """Queue a frame that a drive wants to send."""
+        """Queue a frame that a drive sends, until the bus is free for it."""
         self._waiting.append((sent.ready_ns, self._count, sent))
         self._count += 1
         self._found = None
 
     @property
     def next_ns(self) -> int | None:
-        """Return when the next frame will have been received; None when none waits."""
+        """Return when the next waiting frame will have been received [ns]; None when none waits."""
         found = self._next()
         return None if found is None else found[0]
 
     def take(self) -> Sent:
-        """Return the frame that `next_ns` is about; it occupies the wire until then."""
+        """Remove and return the frame that `next_ns` is about; the bus is occupied until then."""
         found = self._next()
         assert found is not None  # noqa: S101 the caller has checked `next_ns`
         self._free_ns, item = found
@@ -127,7 +127,7 @@ class LockStepArm:
         self.emulator.power_up(self._now_ns)
 
     def link(self, bus: int) -> LockStepLink:
-        """Open one bus.
+        """Open one bus and return its link; DriverError where that bus is open already.
 
         Raises:
             DriverError: it is open already.
@@ -139,18 +139,18 @@ class LockStepArm:
         return LockStepLink(self, bus)
 
     def inject(self, *faults: DriveFault) -> None:
-        """Inject faults, counted from now on."""
+        """Inject faults, counted from now on, and let those that are due begin."""
         self._run(self.clock.now_ns())
         self.emulator.inject(faults, self._now_ns)
         self._run(self._now_ns)
 
     def settle(self, until_ns: int) -> None:
-        """Let time pass without a host."""
+        """Let virtual time pass until `until_ns` without a host; drives act on their timers and faults."""
         self.clock.sleep_until_ns(until_ns)
         self._run(self.clock.now_ns())
 
     def send(self, bus: int, frame: Frame) -> None:
-        """Send a frame of the host; see `LockStepLink.send`."""
+        """Send a frame of the host: drives receive it now, and it occupies the bus for its duration."""
         self._run(self.clock.now_ns())
         self._require_bus(bus)
         frame = self._wires[bus].as_sent(frame)
@@ -158,7 +158,7 @@ class LockStepArm:
         self._put_on_buses(self.emulator.receive(bus, frame, self._now_ns))
 
     def receive(self, bus: int, deadline_ns: int) -> Frame | None:
-        """Return the next frame; see `LockStepLink.receive`."""
+        """Return a bus's next frame and move the time to it; None, and time at the deadline, where none comes."""
         heard = self._heard[bus]
         self._run(self.clock.now_ns())
         while not heard:
@@ -174,7 +174,7 @@ class LockStepArm:
         return heard.popleft() if heard else None
 
     def drain(self, bus: int) -> list[Frame]:
-        """Return all frames until now; see `LockStepLink.drain`."""
+        """Return all frames that have come on a bus until now, without moving the time."""
         self._run(self.clock.now_ns())
         self._require_bus(bus)
         frames = list(self._heard[bus])
@@ -246,12 +246,12 @@ class LockStepLink:
         return self.arm.clock
 
     def send(self, frame: Frame) -> None:
-        """Send a frame: drives receive it now, and it occupies the wire for its duration; DriverError on a dead bus."""
+        """Send a frame: drives receive it now, and it occupies the bus for its duration; DriverError on a dead bus."""
         self._require_open()
         self.arm.send(self._bus, frame)
 
     def receive(self, deadline_ns: int) -> Frame | None:
-        """Return the next frame and move the time to it, or to the deadline; raises DriverError on a dead bus."""
+        """Return the next frame, moving the time to it, or None at the deadline; raises DriverError on a dead bus."""
         self._require_open()
         return self.arm.receive(self._bus, deadline_ns)
 
@@ -278,7 +278,7 @@ _standing: dict[int, LockStepArm] = {}
 def hold_emulated_arm(
     config: ArmConfig, faults: Sequence[DriveFault] = (), clock: VirtualClock | None = None
 ) -> Iterator[LockStepArm]:
-    """Keep an emulated arm alive before links to it are opened and after they are closed.
+    """Yield one emulated arm for the block, to which all links opened from this very configuration lead.
 
     While this lasts, every link that is opened from this very configuration object leads to it. Otherwise each opening
     of the first bus builds an arm anew.
@@ -305,7 +305,7 @@ _begun: tuple[ArmConfig, LockStepArm] | None = None
 
 
 def from_config(config: ArmConfig, number: int) -> LockStepLink:
-    """Open a bus of emulated drives: the entry point `lock_step` of the group `ident_service.can_links`.
+    """Open a bus of emulated drives in virtual time; the first bus builds the arm, later ones lead to it.
 
     Args:
         config: of the arm.

@@ -31,10 +31,10 @@ class Rotor(Protocol):
     """Define the rotors of an arm, queried at any time."""
 
     def angle(self, motor: int, now_ns: int) -> float:
-        """Return the angle of a motor [rad]."""
+        """Return the angle of a motor at this time [rad]."""
 
     def speed(self, motor: int, now_ns: int) -> float:
-        """Return the speed of a motor [rad/s]."""
+        """Return the speed of a motor at this time [rad/s]."""
 
     def changes(self, now_ns: int) -> None:
         """Advance the arm to this time before something that moves it changes."""
@@ -121,7 +121,7 @@ class Motor:
         self.switch_off(now_ns)
 
     def encoder(self, now_ns: int) -> int:
-        """Return the encoder's reading [counts], a signed number of 32 bits."""
+        """Return the encoder's reading with its defects [counts], a signed number of 32 bits."""
         counts = round(self._rotor.angle(self._index, now_ns) * self._per_radian) - self._origin
         self._history.append((now_ns, counts))
         defects = self.defects
@@ -139,7 +139,7 @@ class Motor:
         return self._rotor.speed(self._index, now_ns)
 
     def drive(self, torque: float, now_ns: int) -> None:
-        """Make a torque from now on [N m at the motor]."""
+        """Apply this torque [N m at the motor] from now on, times the motor's own factor of acting to commanded."""
         self._do(Power.TORQUE, torque * self._scale, now_ns)
 
     @property
@@ -156,7 +156,7 @@ class Motor:
         self._do(Power.HELD, 0.0, now_ns)
 
     def fail(self, now_ns: int) -> None:
-        """Open the windings: a power stage that failed does not short them; a brake closes without it."""
+        """Cut the power as a failed power stage does: windings open, or a brake that closes without power."""
         self._do(Power.HELD if self._unpowered is Power.HELD else Power.COAST, 0.0, now_ns)
 
     def brake(self, now_ns: int) -> None:

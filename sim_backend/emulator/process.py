@@ -77,11 +77,11 @@ class PythonCanBuses:
 
     @property
     def waits(self) -> bool:
-        """Return whether a frame has come that needs no look at an interface."""
+        """Return whether a received frame is queued already, so that `receive` returns at once."""
         return not self._heard.empty()
 
     def receive(self, timeout: float) -> tuple[int, Frame] | None:
-        """Return the next frame with its bus, None when none comes in time.
+        """Return the next frame with the number of its bus; None when none comes in time.
 
         Args:
             timeout: how long to wait [s].
@@ -195,11 +195,11 @@ class HostedBuses:
 
     @property
     def waits(self) -> bool:
-        """Return whether a frame has come that needs no look at a wire."""
+        """Return whether a received frame is queued already, so that `receive` returns at once."""
         return bool(self._heard)
 
     def receive(self, timeout: float) -> tuple[int, Frame] | None:
-        """Return the next frame with its bus, None when none comes in time.
+        """Return the next frame with the number of its bus; None when none comes in time.
 
         Args:
             timeout: how long to wait [s].
@@ -212,7 +212,7 @@ class HostedBuses:
         return self._heard.popleft() if self._heard else None
 
     def send(self, frames: Iterable[tuple[int, Frame]]) -> None:
-        """Send frames, those of a bus in one packet; frames that a wire does not take count as `unsent`."""
+        """Send frames, those of a bus in one packet; frames that a bus does not take count as `unsent`."""
         of: dict[int, list[Frame]] = {}
         for number, frame in frames:
             of.setdefault(number, []).append(frame)
@@ -220,7 +220,7 @@ class HostedBuses:
             self.unsent += len(some) - self._ports[number].offer(some)
 
     def close(self) -> None:
-        """Close all wires and their connections; any number of times."""
+        """Close all hosted buses and their connections; any number of times."""
         for wire in self._wires:
             wire.close()
         self._wires.clear()
@@ -278,7 +278,7 @@ class Emulated:
 
 
 def emulated_buses(config: ArmConfig) -> tuple[CanBus, ...]:
-    """Return the buses that a process of emulated drives serves.
+    """Return the buses of an arm's configuration; raises UsageError where no emulator process can serve them.
 
     Raises:
         UsageError: drives that are not on a CAN bus, or in the process that moves them.
@@ -303,7 +303,7 @@ def emulate(
     stop_requested: Callable[[], bool] = lambda: False,
     commands: Callable[[], str | None] = lambda: None,
 ) -> Emulated:
-    """Run the drives of an arm on its configured interfaces until told to stop.
+    """Run the drives of an arm on its configured interfaces until told to stop, and return a summary.
 
     Args:
         config: of the arm.
@@ -312,9 +312,6 @@ def emulate(
         tell: called with a line whenever a drive changes its state, a fault comes or goes, or the arm comes to rest.
         stop_requested: called all the time; True ends the emulation.
         commands: function that returns the next line of commands, None while there is none; never waits.
-
-    Returns:
-        The summary.
 
     Raises:
         UsageError: as `emulated_buses`; a malformed fault.

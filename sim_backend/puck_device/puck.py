@@ -136,12 +136,12 @@ class EmulatedPuck:
         return address.destination in (self.values[name] for name in _GROUPS)
 
     def traffic_kind(self, frame: Frame) -> Traffic:
-        """Return the kind of a frame that this puck has sent."""
+        """Return FEEDBACK for a position that this puck has sent, else OTHER."""
         address = address_of(frame.identifier)
         return Traffic.FEEDBACK if address.group and address.destination == Group.POSITIONS else Traffic.OTHER
 
     def receive(self, frame: Frame, now_ns: int) -> list[Frame]:
-        """Process a frame of the host: torques, a GET, which is answered, or a SET."""
+        """Process a host's frame: set torques or a property, or return the answer to a GET."""
         if frame.error or frame.remote or frame.extended:
             return []
         address = address_of(frame.identifier)
@@ -164,11 +164,11 @@ class EmulatedPuck:
         return [reply(self._node, request.number, self._value(name, now_ns), wide=self._properties.is_wide(name))]
 
     def finish_sync(self, now_ns: int) -> list[Frame]:
-        """Do nothing: torques act when they come."""
+        """Do nothing and return no frames: torques act when they come."""
         return []
 
     def set_mode(self, mode: Mode, now_ns: int) -> None:
-        """Take the mode that the safety puck sets."""
+        """Take the mode that the safety puck sets, with zero torque; do nothing while asleep or in error."""
         if self._stat is not Status.READY:
             return
         self._told = 0
@@ -176,7 +176,7 @@ class EmulatedPuck:
         self.evaluate(now_ns)
 
     def evaluate(self, now_ns: int) -> None:
-        """Set the power stage to what mode, torque and defects make of it."""
+        """Set the power stage: failed in an error, the limited torque in mode TORQUE, else off."""
         if self._stat is Status.ERROR:
             self.motor.fail(now_ns)
         elif self._mode is Mode.TORQUE:
@@ -187,14 +187,14 @@ class EmulatedPuck:
             self.motor.switch_off(now_ns)
 
     def tick(self, now_ns: int) -> list[Frame]:
-        """Do nothing: a puck has no timer."""
+        """Do nothing and return no frames: a puck has no timer."""
         return []
 
     def watch(self, now_ns: int) -> None:
         """Do nothing: a puck limits torque by its counts alone."""
 
     def fail(self, code: int, now_ns: int, *, lasting: bool = False) -> list[Frame]:
-        """Set an error: STAT 1, no torque."""
+        """Enter an error, STAT 1 without torque, not to be cleared while it lasts; return no frames."""
         self._stat, self._mode, self._told = Status.ERROR, Mode.IDLE, 0
         self.values["ERROR"] = code & 0x7FFF
         self._lasting = self._lasting or lasting
@@ -202,7 +202,7 @@ class EmulatedPuck:
         return []
 
     def repaired(self) -> None:
-        """End the cause of a lasting error."""
+        """End the cause of a lasting error, which a host may clear then."""
         self._lasting = False
 
     def ignore_watchdogs(self, deaf: bool) -> None:
@@ -210,17 +210,17 @@ class EmulatedPuck:
         self._safety.ignores_heartbeat = deaf
 
     def warn(self, warned: bool, now_ns: int) -> list[Frame]:
-        """Set or clear the warning of the supply's voltage."""
+        """Set or clear the safety puck's warning of low supply voltage; return no frames."""
         self._safety.low_supply(warned)
         return []
 
     def supply(self, on: bool, now_ns: int) -> list[Frame]:
-        """Release or press the emergency stop."""
+        """Release the emergency stop (on) or press it (off); return no frames."""
         self._safety.emergency_stop(not on, now_ns)
         return []
 
     def reboot(self, now_ns: int) -> list[Frame]:
-        """Restart the firmware: it is in its monitor, without torque, and has lost its position."""
+        """Restart the firmware: in its monitor, without torque and its position; return no frames."""
         self._stat, self._mode, self._told, self._offset = Status.RESET, Mode.IDLE, 0, 0
         self.motor.power_up(now_ns)
         return []

@@ -120,7 +120,7 @@ class EmulatedSafetyPuck:
         return min(due, default=None)
 
     def power_up(self, now_ns: int) -> None:
-        """Start the firmware; the arm is idle."""
+        """Start the firmware at this time; mode, pendant and faults stay as they are."""
         self._now_ns = now_ns
 
     def listens(self, identifier: int) -> bool:
@@ -131,7 +131,7 @@ class EmulatedSafetyPuck:
         return address.destination == self.number
 
     def receive(self, frame: Frame, now_ns: int) -> list[Frame]:
-        """Answer a request for this puck, or watch torques."""
+        """Process a frame: watch its torques, set a property, or answer a GET; return the frames to send."""
         self._now_ns = now_ns
         if frame.error or frame.remote or frame.extended:
             return self._taken()
@@ -149,7 +149,7 @@ class EmulatedSafetyPuck:
         return self._taken()
 
     def tick(self, now_ns: int) -> list[Frame]:
-        """Process what is due: a missed heartbeat, an arm that stays too fast, a key that a person presses."""
+        """Process a missed heartbeat, lasting overspeed or a key press that is due; return the frames to send."""
         self._now_ns = now_ns
         silent = self._traffic_ns is not None and now_ns - self._traffic_ns >= self._heartbeat_ns
         if self.mode is SafetyMode.ACTIVE and silent and not self.ignores_heartbeat:
@@ -166,7 +166,7 @@ class EmulatedSafetyPuck:
         return self._taken()
 
     def press(self, key: str, now_ns: int) -> None:
-        """Press Shift-Activate or Shift-Idle on the pendant: `activate` or `idle`."""
+        """Press a pendant key: `idle`, which clears faults, or `activate`, which acts in IDLE without faults."""
         self._now_ns = now_ns
         if self._pressed:
             return
@@ -192,7 +192,7 @@ class EmulatedSafetyPuck:
         self._low_supply = low
 
     def watch_position(self, place: int, counts: int, now_ns: int) -> None:
-        """Watch the position that a motor puck has sent: `place` as `supervise` gave it."""
+        """Count a motor puck's position as traffic, and check the speed once all have sent theirs."""
         self._traffic_ns = now_ns
         self._counts[place] = counts
         if place == len(self._counts) - 1 and None not in self._counts:
