@@ -85,7 +85,7 @@ class Thinned:
 
 
 def thinned(samples: Samples, names: tuple[str, ...], first_ns: int) -> Thinned:
-    """Return one point of every bin of `BIN_NS` of samples.
+    """Return the last sample of every bin of `BIN_NS`, with the error of greatest magnitude in the bin.
 
     Args:
         samples: consecutive cycles.

@@ -92,7 +92,7 @@ def _check_lines(check: Check) -> list[str]:
 
 
 def nearest_measure(check: Check) -> Measure | None:
-    """Return the measure that is nearest to its limit."""
+    """Return the measure with the least room to its limit, relative to that; None if none has value and limit."""
 
     def room(one: Measure) -> float:
         assert one.value is not None  # noqa: S101
@@ -204,7 +204,7 @@ class ScaleCheck:
 
 
 def check_scale(config: ArmConfig, state: Path, ask: Callable[[str], str], arm: Arm | None = None) -> list[ScaleCheck]:
-    """Ask for a turn of each joint, compare it with the drives' positions, and keep the answers in `scale.json`.
+    """Have a person turn each joint by hand, compare with the drives' positions, and write `scale.json`.
 
     Args:
         config: of the arm; nothing is energised.

@@ -225,7 +225,7 @@ _AT_REST = 0.99  # share of the time at standstill of a recording that shows not
 
 
 def custom_of(arm: str, config: ArmConfig) -> CustomFunction | None:
-    """Load the function that a description names as `constraints.custom`, from beside it or from `sys.path`.
+    """Load the function that a description names as `constraints.custom`; None where it names none.
 
     Args:
         arm: description file or name of a shipped one.

@@ -94,7 +94,7 @@ class PrunableRecording:
 
 
 def prunable_recordings(db: Database, state: Path, newest: int) -> list[PrunableRecording]:
-    """Return the recordings that `prune` would delete.
+    """Return the recordings that `prune` would delete: of older runs, needed by no acceptance and no job.
 
     Kept are those of accepted runs, those of other runs that an accepted set was identified from or judged on, those of
     each arm's `newest` runs, and those that a waiting or running job makes or reads.

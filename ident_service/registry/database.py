@@ -270,7 +270,7 @@ _WANTED = 2**16  # bytes; SQLite's shared index of its log takes half of them, a
 
 
 def registry_error(path: Path, error: Exception) -> IdentError:
-    """Return what an error of SQLite, or of the registry's disk, means to whoever asked.
+    """Return, without raising it, the error that tells a user of one of SQLite: busy, disk full, damaged or not usable.
 
     Args:
         path: the registry's file.
@@ -285,7 +285,7 @@ def registry_error(path: Path, error: Exception) -> IdentError:
 
 
 def shortage(path: Path, error: BaseException) -> RegistryBusy | DiskFull | None:
-    """Return what is short for a while where an error says so; None where it says something else.
+    """Return, without raising it, RegistryBusy or DiskFull where an error says so; None for any other error.
 
     Args:
         path: the registry's file.
@@ -530,7 +530,7 @@ def note(db: Database, who: str, what: str, about: str, **detail: Any) -> None:
 
 
 def note_later(state: Path, who: str, what: str, about: str, **detail: Any) -> None:
-    """Leave one line, with the time of now, for whoever can write the registry next; as `note`.
+    """Store an audit line, with the present time, in a file, from where it is entered later; as `note`.
 
     Args:
         state: the state folder.
@@ -549,7 +549,7 @@ def note_later(state: Path, who: str, what: str, about: str, **detail: Any) -> N
 
 
 def write_deferred_entries(db: Database, state: Path) -> None:
-    """Enter the lines that `note_later` has left; each once, whoever is killed meanwhile."""
+    """Enter the lines that `note_later` has stored in files, each once, and delete the files."""
     place = state / _WAITING
     for path in sorted(place.glob("*.json")) if place.is_dir() else ():
         try:
@@ -576,7 +576,7 @@ class AuditQueue:
         self._thread.start()
 
     def note(self, who: str, what: str, about: str, **detail: Any) -> None:
-        """Queue one line with the present time; never waits."""
+        """Queue one line with the present time; never waits. It is lost, with an error logged, if too many wait."""
         line = _line(who, what, about, detail)
         with self._changed:
             if len(self._lines) < _MOST_WAITING:

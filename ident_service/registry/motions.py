@@ -78,5 +78,5 @@ def motions(db: Database, arm: str | None = None, *, before: str | None = None, 
 
 
 def motion_path(db: Database, state: Path, motion: str) -> Path:
-    """Return the file of a motion, from the id in the registry, never from a word of the request."""
+    """Return the path of a motion's file, by the id in the registry, never by a word of the request; or UnknownId."""
     return state / MOTIONS / str(known_motion(db, motion)["id"]) / MOTION_FILE

@@ -34,7 +34,7 @@ _RECORDING = ".mcap"
 
 
 def index_run(db: Database, state: Path, run: str) -> Row:
-    """Enter a run's folder in the registry, or enter it again.
+    """Verify a run's folder and enter it, its recordings and parameters in the registry, also again; return the row.
 
     Raises:
         UsageError: no such folder, or no arm in it.
@@ -113,7 +113,7 @@ def runs(db: Database, arm: str | None = None, *, before: str | None = None, mos
 
 
 def recordings(db: Database, run: str) -> list[Row]:
-    """Return the recordings of a run."""
+    """Return name, hash, size and time of deletion, None if kept, of each recording of a run, by name."""
     return db.rows("SELECT name, sha256, bytes, deleted FROM recordings WHERE run = ? ORDER BY name", run)
 
 
@@ -192,13 +192,13 @@ def run_labels(db: Database, run: str | None = None) -> dict[str, Row]:
 
 
 def shown_labels(found: Mapping[str, Row], run: str) -> dict[str, Any]:
-    """Return `tags` and `note` of a run from what `run_labels` found; none where nobody gave it any."""
+    """Return `tags` and `note` of a run from what `run_labels` found; empty ones where nobody gave it any."""
     row = found.get(run, {"tags": [], "note": ""})
     return {"tags": row["tags"], "note": row["note"]}
 
 
 def run_folder(db: Database, state: Path, run: str) -> Path:
-    """Return the folder of a run, from the id in the registry, never from a word of the request."""
+    """Return the path of a run's folder, by the id in the registry, never by a word of the request; or UnknownId."""
     return state / RUNS / str(known_run(db, run)["id"])
 
 

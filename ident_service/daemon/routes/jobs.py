@@ -77,7 +77,7 @@ class JobRequest(RequestBody):
 
 
 def require_confirmed(service: Service, arm: str, confirm: Confirmation | None, who: str) -> None:
-    """Refuse a motion that no person has confirmed.
+    """Raise MotionRefused unless the typed name is the arm's and the challenge this caller's; uses that up.
 
     Raises:
         MotionRefused: no confirmation, or one that does not count.
@@ -122,7 +122,7 @@ def create_job(
 
 
 def begin_job(service: Service, who: Access, body: JobRequest) -> answers.JobAnswer:
-    """Queue the job of a request to the API or of a page.
+    """Queue the job of a request to the API or of a page; refuse a motion that no person has confirmed.
 
     Raises:
         MotionRefused: a motion that no person has confirmed.
@@ -164,7 +164,7 @@ def get_log(service: Serving, _: Viewer, job: Id) -> PlainTextResponse:
 
 @router.get("/jobs/{job}/result")
 def get_result(service: Serving, _: Viewer, job: Id) -> answers.JobResult:
-    """Return what the command of a job answered."""
+    """Return the JSON answer and the text that the command of a job has printed."""
     row = rows.known_job(service.db, job)
     output = process_output(service.state / JOBS / row["id"])
     return answers.JobResult(job=row["id"], **_named({"answer": output.answer, "text": output.text}, service, row))
@@ -209,7 +209,7 @@ async def stop_all(service: Serving, who: Near) -> answers.StopAnswer:
 
 @router.post("/arms/{arm}/stop")
 async def stop_arm(service: Serving, who: Near, arm: ArmName) -> answers.StopAnswer:
-    """Stop an arm, under control; as for all arms; it is no error if no process moves it, but 404 for no arm at all."""
+    """Stop one arm, under control; whoever may stop all may stop one. 404 for an unknown arm, none for one at rest."""
     return await _stop(service, arm, who)
 
 
@@ -234,7 +234,7 @@ async def _may_be_known(service: Service, arm: str) -> bool:
 
 
 def job_answer_document(service: Service, row: Row) -> answers.JobAnswer:
-    """Return a job as the API answers it, without its command's own text, which names paths of this machine."""
+    """Make the API's answer on a job from its row: state, progress, what it waits for; no paths of this machine."""
     found = service.engine.progress(row)
     shown = {key: value for key, value in row.items() if key in answers.JobAnswer.model_fields}
     shown["detail"] = _named(row["detail"], service, row)
@@ -261,7 +261,7 @@ def _named(value: Any, service: Service, row: Row) -> Any:
 
 
 def without_paths(value: Any, state: str, named: Mapping[str, str] = NOTHING) -> Any:
-    """Return values in which paths below the state folder are relative to it.
+    """Make paths in all texts of JSON values relative to the state folder; replace those in `named` by their names.
 
     Args:
         value: JSON values.

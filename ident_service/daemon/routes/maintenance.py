@@ -217,7 +217,7 @@ def add_maintenance(service: Serving, who: Operator, arm: ArmName, body: Event) 
 
 @router.get("/due")
 def list_due(service: Serving, _: Viewer, arm: ArmName | None = None) -> list[DueAnswer]:
-    """List what is due, the earliest first; a re-identification of the arm that comes to a verdict ends it."""
+    """List re-identifications that are due, the earliest first; one that comes to a verdict ends them."""
     return [DueAnswer(**row) for row in planned.pending_with_accepted(service.db, service.state, arm)]
 
 
@@ -238,7 +238,7 @@ def list_reidentifications(
 
 @router.post("/reidentifications", status_code=201)
 def begin_reidentification(service: Serving, who: Operator, body: NewReidentification) -> ReidentificationAnswer:
-    """Re-identify an arm: check, run, identify, compare with the accepted set.
+    """Begin to re-identify an arm: preflight, run, identify, compare with the accepted set.
 
     The lease is renewed until the arm has come to rest.
     """

@@ -120,7 +120,7 @@ class CommissioningWorkflow:
 
 
 def commissioning_workflow(db: Database, state: Path, config: ArmConfig) -> CommissioningWorkflow:
-    """Return the commissioning steps of an arm with their states.
+    """Return an arm's commissioning steps with their states, as its jobs, runs and acceptances show them.
 
     Raises:
         ParameterError: the accepted set cannot be read.
@@ -410,7 +410,7 @@ def ask_confirmation(service: Serving, who: Operator, arm: ArmName, form: Form) 
 
 @router.post("/arms/{arm}/move")
 def move(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
-    """Begin a motion that a person has confirmed; the page of its job keeps its lease from then on."""
+    """Queue a motion that a person has confirmed; go to the page of its job, which renews its lease."""
     if form.get("kind") == "rehearse":
         raise UsageError("a rehearsal begins when the button of its page is held")
     asked = _requested_job(arm, form)
@@ -465,7 +465,7 @@ def pause(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response
 
 @router.post("/arms/{arm}/finish")
 def finish(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
-    """End a run early by its regular end."""
+    """End a run early: the rest of the motion is left out, and the arm goes back to its start."""
     arms.finish(service, who, arm)
     return _back(service, arm, form)
 

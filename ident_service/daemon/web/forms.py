@@ -89,7 +89,7 @@ def see_other(address: str) -> RedirectResponse:
 
 
 def inside(address: str) -> str:
-    """Return the address if it is on this service, else that of the first page."""
+    """Return the address if it is a path on this service, else `/`."""
     good = address.startswith("/") and not address.startswith("//") and "\\" not in address and address.isprintable()
     return address if good else "/"
 

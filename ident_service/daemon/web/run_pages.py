@@ -81,7 +81,7 @@ class IdentifiedSet:
 
 
 def identified_set(service: Service, run: str) -> IdentifiedSet | None:
-    """Return what pages show of a run's parameters; None where it has no parameter file, or one that cannot be read."""
+    """Return a run's base parameters with their verdicts; None without a parameter file that can be read."""
     files = known.run_files(service.db, service.state, run)
     if PARAMETERS not in files:
         return None
@@ -135,7 +135,7 @@ class RunFacts:
 
 
 def run_facts(service: Service, run: str) -> RunFacts:
-    """Return the facts of a run, as far as its files tell them."""
+    """Return motion, duration, speed, ending, joints and recording of a run, as far as its files tell them."""
     row, folder = known.known_run(service.db, run), known.run_folder(service.db, service.state, run)
     files = known.run_files(service.db, service.state, run)
     ended = _ending(_small(folder / ENDED)) if ENDED in files else {}
@@ -216,7 +216,7 @@ def list_runs(
     parameter: Annotated[list[str] | None, Query(max_length=8)] = None,
     before: BeforeId = None,
 ) -> Response:
-    """Show the table of runs, the newest first, or those of an arm, a kind, a tag or with a text in id or note."""
+    """Show a page of the table of runs, the newest first; kind, tag and text choose among those of the page."""
     labels = known.run_labels(service.db)
     found = known.runs(service.db, arm or None, before=before, most=_RUNS + 1)
     more, found = len(found) > _RUNS, found[:_RUNS]
@@ -342,7 +342,7 @@ def trend(service: Serving, who: Viewer, arm: ArmName) -> Response:
 
 
 def trends(sets: list[tuple[Row, IdentifiedSet]], reference: str | None) -> list[dict[str, Any]]:
-    """Return a row per base parameter of the newest set: values over the runs, and the change since the accepted set.
+    """Return a row per base parameter of the newest set: values over the runs, change since the accepted set.
 
     Args:
         sets: rows of runs and their parameters, the earliest first.

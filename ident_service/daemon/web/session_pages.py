@@ -36,7 +36,7 @@ def show_login(where: Next = "/") -> Response:
 
 @router.post("/login")
 def log_in(service: Serving, request: Request, form: Form) -> Response:
-    """Exchange the form's token for a session."""
+    """Exchange the form's token for a session and go to the page asked for, or show the form again."""
     where, answer = inside(form.get("next", "/")), see_other(inside(form.get("next", "/")))
     try:
         about.login(service, request, answer, about.Login(token=form.get("token", "").strip()[:200] or "none"))

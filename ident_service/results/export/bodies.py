@@ -24,7 +24,7 @@ def moved(parameters: Array, rotation: Array, translation: Array) -> Array:
 
 
 def about_origin(mass: float, center: Array, inertia: Array) -> Array:
-    """Return the ten parameters of a body, the inverse of `about_center`, shape (10,)."""
+    """Return the ten parameters of eq. 13, (10,), of mass [kg], centre [m], and inertia about the centre [kg m^2]."""
     L = inertia + mass * (center @ center * np.eye(3) - np.outer(center, center))
     return body_parameters(L, mass * center, mass)
 
@@ -60,7 +60,7 @@ def joint_bodies(model: ArmModel, delta: Array) -> Array:
 
 
 def require_real(model: ArmModel, bodies: Array, reader: str) -> None:
-    """Refuse bodies without a real mass distribution, for readers that refuse them.
+    """Raise ModelError if no real mass distribution has one of the bodies, which the program `reader` refuses.
 
     Raises:
         ModelError: no distribution of mass has the inertia of a link.

@@ -49,7 +49,7 @@ _RESULT = re.compile(rf"^    ([a-zA-Z]+)\[(\d+)\] = ({_OPERAND});$")
 
 
 def c_lines(tape: ExpressionGraph, inputs: Mapping[int, str], outputs: Sequence[tuple[str, Value]]) -> list[str]:
-    """Return the body of a C function, indented.
+    """Return the C statements, indented, that compute the outputs of an expression graph from its inputs.
 
     Args:
         tape: recorded expression graph.
@@ -86,7 +86,7 @@ def _operand(value: int | float | None, names: Mapping[int, str]) -> str:
 
 
 def run_c_lines(lines: Sequence[str], arrays: Mapping[str, Array]) -> dict[str, Array]:
-    """Run lines that `c_lines` has written, from their text alone.
+    """Compute, with numpy, the statements that `c_lines` has written, and return the arrays that they write to.
 
     Args:
         lines: the body of a function.
@@ -138,7 +138,7 @@ _Formulas = Callable[[ExpressionGraph, dict[int, Value], dict[str, list[Symbol]]
 
 
 def c_prefix(arm: IdentifiedArm) -> str:
-    """Return the prefix of every name in the header."""
+    """Return the prefix of every name in the header: the arm's name as a C identifier."""
     return identifier(arm.model.config.name)
 
 
