@@ -104,7 +104,7 @@ class MotionTraces:
         return np.where(sign * limit >= LARGEST, np.inf, sign * limit)
 
     def shares(self, quantity: str) -> Array:
-        """Return the largest share of the way from the middle to a limit, shape (joints,).
+        """Return each joint's largest distance from mid-range over half the range, (joints,), so that 1 is at a limit.
 
         1 is at a limit. NaN where a joint has no limits on both sides, or the quantity is not given.
         """

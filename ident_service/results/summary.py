@@ -266,7 +266,7 @@ def _preliminary_findings(estimate: Estimate) -> list[str]:
 
 
 def torque_constants_document(estimate: Estimate) -> dict[str, Any]:
-    """Return the torque constants of the motors as JSON values, where they were identified."""
+    """Return the identified torque constants of the motors as JSON values; an empty dict if they were not."""
     found = estimate.prepared.torque_constants
     if found is None:
         return {}

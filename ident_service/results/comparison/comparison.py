@@ -293,7 +293,7 @@ class Pair:
 
     @property
     def verdict(self) -> Verdict:
-        """Return the verdict in one word; `impossible` also where friction of another shape was left out."""
+        """Return `changed`, `unchanged` or `impossible`; the last also where friction of another shape was left out."""
         if self.drift is None or (self.drift.verdict == "unchanged" and self.other_shape):
             return "impossible"
         return self.drift.verdict

@@ -326,7 +326,7 @@ class Welch:
         return self._segments > 0
 
     def density(self) -> tuple[Array, Array]:
-        """Return frequencies [Hz], shape (lines,), and densities, (series, lines), denser at low frequencies."""
+        """Return frequencies [Hz], (lines,), closer together where low, and power spectral density (series, lines)."""
         frequency = np.arange(1, self._density.shape[1]) * self.rate / self.length
         density = self._density[:, 1:] / max(self._segments, 1)
         edges = np.unique(np.geomspace(1, len(frequency) + 1, _LINES + 1).astype(int)) - 1
@@ -359,7 +359,7 @@ class Scatter:
         self._kept = 0
 
     def add(self, rows: Array) -> None:
-        """Add the next rows, shape (samples, columns)."""
+        """Add the next rows, shape (samples, columns), of which every n-th is kept, so that they stay few enough."""
         first = -self._seen % self._step
         self._seen += len(rows)
         self._rows.append(rows[first :: self._step].copy())
@@ -421,7 +421,7 @@ class FrictionCollector:
         self._points = Scatter()
 
     def add(self, rows: Rows, torque: Array) -> None:
-        """Add the next equations, with their torques as the estimate counts them, shape (samples, joints)."""
+        """Add velocity and non-rigid torque of each drive; `torque` as the estimate counts it, (samples, joints)."""
         if not self._places or not len(rows.time):
             return
         rigid = np.tensordot(self._estimate.beta[self._rigid], rows.H_b[:, self._rigid], axes=(0, 1)).T

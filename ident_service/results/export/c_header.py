@@ -143,7 +143,7 @@ def c_prefix(arm: IdentifiedArm) -> str:
 
 
 def c_header(arm: IdentifiedArm) -> str:
-    """Return the header, read back and found to have the torques and the mass matrix of the base parameters.
+    """Return the arm as a C header, read back and found to have the torques and mass matrix of the base parameters.
 
     Raises:
         ModelError: what is read back differs.
@@ -335,7 +335,7 @@ static inline void NAME_inverse_dynamics(const double q[], const double dq[], co
 
 
 def read_c_header(text: str, name: str, function: str, states: dict[str, Array]) -> Array:
-    """Run one function of a header from its text.
+    """Compute, from a header's text alone, what one of its functions writes for these states, (values, samples).
 
     Args:
         text: the header.

@@ -35,7 +35,7 @@ _ATTRIBUTES = dict(zip(JOINT_TERMS, ("armature", "damping", "frictionloss"), str
 def mjcf_export(
     model: ArmModel, delta: Array, name: str, said: tuple[str, ...] = (), motion: RecordedMotion | None = None
 ) -> tuple[str, tuple[str, ...]]:
-    """Return the arm as MJCF, after pinocchio has read it back with the same torques.
+    """Return (MJCF text, what it does not carry), after pinocchio has read it back with the same torques.
 
     Args:
         model: the arm.
