@@ -99,9 +99,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     Args:
         argv: the words after `ident`; those of the process if None.
 
-    Returns:
-        The exit code.
-
     Raises:
         SystemExit: with 0 after help or version, with 2 after words that no verb understands.
     """

@@ -250,9 +250,6 @@ class VerbList:
             former: the verb's earlier name, which is still understood and not listed.
             hidden: leave the verb out of the list of verbs.
             word: the verb that a hidden one stands for.
-
-        Returns:
-            Its parser, to add arguments to.
         """
         word = word or f"{self.prefix}{name}"
         if not hidden:

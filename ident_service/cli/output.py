@@ -30,9 +30,9 @@ _STYLES = {"error": "1;31", "heading": "1", "next": "36"}
 
 
 def styled(stream: TextIO | None, text: str, style: str) -> str:
-    """Return text in the style `error`, `heading` or `next` where the stream is a terminal that shows colours.
+    """Return text in the colour of `error`, `heading` or `next` on a terminal that shows colours, else unchanged.
 
-    They are left out in pipes and files, in a terminal called `dumb`, and where `NO_COLOR` is set (no-color.org).
+    Colours are left out in pipes and files, in a terminal called `dumb`, and where `NO_COLOR` is set (no-color.org).
     """
     if stream is None or not stream.isatty() or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
         return text

@@ -203,7 +203,7 @@ class IdentClient(Connection):
         return found
 
     def job(self, job: str) -> Job:
-        """Return the present state of a job."""
+        """Ask the daemon for the present state of a job, and return it."""
         return _job(self.get(f"{_API}/jobs/{_word(job)}"))
 
     def events(self, *, after: int | None = None, samples: bool = False) -> Iterator[Event]:
@@ -305,10 +305,7 @@ class IdentClient(Connection):
         return ended
 
     def failure(self, ended: Job) -> IdentError:
-        """Return, without raising it, the error that says why a job is not `done`, or its arm stopped and held.
-
-        Of one whose arm is held, it says why the arm was stopped.
-        """
+        """Return, without raising it, the error that says why a job is not `done`, or its arm stopped and held."""
         if ended.held:
             return self._held(ended)
         said = self.answer(ended.id).get("error") or {}
@@ -366,7 +363,7 @@ class RemoteArm:
         return found
 
     def faults(self) -> list[dict[str, Any]]:
-        """List the faults that nobody has acknowledged (`FaultAnswer`)."""
+        """List the faults of the arm that nobody has acknowledged (`FaultAnswer`)."""
         found: list[dict[str, Any]] = self.client.get(f"{self._path}/faults")
         return found
 

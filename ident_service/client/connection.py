@@ -72,15 +72,15 @@ class Connection:
             raise errors.UsageError(f"{url}: cannot be asked: {error}") from None
 
     def get(self, path: str) -> Any:
-        """Send GET for a path and return the answer's JSON values; raises as `ask`."""
+        """Send GET for a path and return the answer's JSON values; raise IdentError if it fails."""
         return self.ask("GET", path)
 
     def post(self, path: str, body: Any = None, headers: Mapping[str, str] = NOTHING) -> Any:
-        """Send POST to a path, an empty object without a body, and return the answer's JSON values; raises as `ask`."""
+        """Send POST to a path, an empty object if there is no body; return the answer's JSON values, or raise."""
         return self.ask("POST", path, {} if body is None else body, headers)
 
     def delete(self, path: str) -> Any:
-        """Send DELETE for a path and return the answer's JSON values; raises as `ask`."""
+        """Send DELETE for a path and return the answer's JSON values; raise IdentError if it fails."""
         return self.ask("DELETE", path)
 
     def ask(
@@ -107,7 +107,7 @@ class Connection:
         return self._document(*self._exchange(method, path, body, headers, patience)[:2])
 
     def pages(self, path: str) -> Iterator[Any]:
-        """Yield the entries of a paged list, page by page to its end; raises as `ask`."""
+        """Yield the entries of a paged list, requesting page by page to its end; raise IdentError if that fails."""
         after: str | None = path
         while after is not None:
             status, content, after = self._exchange("GET", after, None, {})

@@ -159,7 +159,7 @@ class Connections:
                 self._waiting[peer] = self._now() + HEADER_SECONDS
 
     def closed(self, connection: Connection) -> None:
-        """Remove a connection that is closed."""
+        """Remove a connection that is closed from the table."""
         if self._open.get(connection.peer) is connection:
             self._forget(connection.peer)
         elif connection.leaving:
@@ -365,7 +365,7 @@ class FairReader(H11Protocol):
         self._drop_answer()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Forget what has not been read."""
+        """Drop what has been received of a lost connection and not been handled."""
         self._forget()
         super().connection_lost(exc)
 
@@ -404,7 +404,7 @@ class FairReader(H11Protocol):
         return before != (self.cycle, self.conn.their_state)
 
     def go_on(self) -> None:
-        """Wait for the next turn if something waits to be read, else receive more."""
+        """Queue for the next turn if received input is left, else let the transport receive more."""
         if self._waits:
             self._wait(self._turns)
         elif not self.flow.read_paused and not self.transport.is_closing():

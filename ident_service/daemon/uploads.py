@@ -407,11 +407,7 @@ def delete_upload(state: Path, upload: str) -> None:
 
 
 def delete_stale_uploads(state: Path) -> list[str]:
-    """Delete uploads of which nothing has arrived for a day; return their ids.
-
-    Returns:
-        Their ids.
-    """
+    """Delete uploads of which nothing has arrived for a day; return their ids."""
     now, place, gone = time.time(), state / UPLOADS, []
     for folder in sorted(place.iterdir()) if place.is_dir() else ():
         with suppress(OSError):

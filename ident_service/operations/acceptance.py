@@ -178,7 +178,7 @@ def current_file(state: Path, arm: str) -> Path:
 
 
 def synchronise(db: Database, state: Path) -> None:
-    """Bring `current` and the registry up to date with the accepted sets of every arm; after a kill, for example."""
+    """Bring each arm's folder `current` and the registry up to date with its accepted sets on the disk."""
     place = state / "arms"
     for folder in sorted(place.iterdir()) if place.is_dir() else ():
         if (folder / ACCEPTED).is_dir():

@@ -108,7 +108,7 @@ def nearest_measure(check: Check) -> Measure | None:
 
 
 def watch_text(seen: Watched) -> str:
-    """Format the readings of an arm at rest as text."""
+    """Format positions, noise, missing answers and drive states of an arm at rest as text."""
     width = max(5, *(len(name) for name in seen.joint_names))
     lines = [
         f"{seen.cycles} cycles, {seen.lost} frames lost",
@@ -146,7 +146,7 @@ class SampleLines:
 
 
 def watch_document(seen: Watched) -> dict[str, Any]:
-    """Return the readings of an arm at rest as JSON values."""
+    """Return positions, noise, missing answers and drive states of an arm at rest as JSON values."""
 
     def number(value: float) -> float | None:
         return float(value) if isfinite(value) else None

@@ -31,7 +31,7 @@ _PLACES: Final = (RUNS, MOTIONS, DESCRIPTIONS, "arms")
 
 
 def delete_run(db: Database, state: Path, run: str, who: str, *, anyway: bool = False) -> list[Dependent]:
-    """Delete a run's folder and report unless something refers to it, or `anyway`; return what does.
+    """Delete a run's folder and report, unless something refers to it or with `anyway`; return what referred to it.
 
     Acceptances keep their copy of its parameters, and operating hours still count it.
 

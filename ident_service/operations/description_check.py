@@ -59,12 +59,12 @@ class CheckedDescription:
 
     @property
     def good(self) -> bool:
-        """Return whether there are no objections; limits that an arm without a driver lacks are none."""
+        """Return whether there are no objections; `missing`, what only a motion would need, does not count."""
         return not self.objections
 
 
 def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescription:
-    """Load a description, build its model, judge bus budget, gains and stop behaviour; return all with objections.
+    """Load a description, build its model, judge bus budget, gains and stop behaviour; return what was found.
 
     Args:
         arm: file of the description, or name of a shipped one.

@@ -162,7 +162,7 @@ def _require_own_meshes(source: Path) -> None:
 
 
 def main(words: list[str]) -> int:
-    """Judge or draw the description file that the first argument names, or describe the URDF there."""
+    """Judge or draw the description file named first, or describe the URDF there; print the answer as JSON."""
     if words[1:2] == [_NEW]:
         return answer_within(MOST_MEMORY, _NEW_SECONDS, lambda: _new_document(Path(words[0]), words[2]))
     if words[1:2] == [_DRAW]:

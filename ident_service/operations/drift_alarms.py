@@ -72,8 +72,8 @@ def raise_alarm(db: Database, arm: str, reidentification: str, run: str, what: s
 def raise_fleet_alarms(db: Database, document: Mapping[str, Any], made: str, now: float) -> None:
     """Raise an alarm for each change in a fleet unless one for it is open or was raised since the change.
 
-    A change was told if an alarm of that arm and group stands, or was raised by a fleet after the change. What goes on
-    drifting after somebody acknowledged it is told again.
+    An alarm is for the change if it is of that arm and group, and is open or was raised after the change. What goes on
+    drifting after somebody acknowledged it raises another one.
 
     Args:
         db: the registry.

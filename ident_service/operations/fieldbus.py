@@ -507,7 +507,7 @@ def probe_text(config: ArmConfig, found: Probe) -> str:
 
 
 def probe_advice(found: Probe) -> list[str]:
-    """Return sentences on what helps where drives or files cannot be driven as described, alike ones in one."""
+    """Return what helps where drives or files cannot be driven as described, one sentence for all that are alike."""
     advice: dict[str, list[str]] = {}
     for one in found.probed:
         if not one.drivable:

@@ -119,7 +119,7 @@ def identify_files(
     tell: Callable[[str], None] = lambda _: None,
     step: Step = lambda words, share: None,
 ) -> IdentificationResult:
-    """Identify an arm from files and write the results.
+    """Identify an arm from recordings, and write the results into a folder, in place of an earlier result there.
 
     Args:
         request: recordings and options.

@@ -51,7 +51,7 @@ class Cron:
 
 
 def parse_cron(text: str) -> Cron:
-    """Parse cron's five fields: minute, hour, day of month, month, day of week.
+    """Parse and check cron's five fields: minute, hour, day of month, month, day of week; others raise UsageError.
 
     Raises:
         UsageError: they are not; the message names the field.
@@ -138,7 +138,7 @@ def schedules(db: Database, arm: str | None = None) -> list[Row]:
 
 
 def known_schedule(db: Database, number: int) -> Row:
-    """Return the schedule of this number.
+    """Return the row of the schedule of this number; raise UnknownId where there is none.
 
     Raises:
         UnknownId: there is none.

@@ -406,7 +406,7 @@ def run_motion(
     requested_ns: int | None = None,
     until: Target | None = None,
 ) -> RunResult:
-    """Move an arm along a motion, or to a destination, and record it.
+    """Move an arm along a motion, or to a destination, by a valid ticket, and record it into a new folder.
 
     Args:
         config: of the arm.

@@ -83,7 +83,7 @@ class CorrectedFile:
 def check_file(
     path: Path, kind: FeasibleSetName | None = None, arm: str | None = None, notation: Notation | None = None
 ) -> CheckedFile:
-    """Test the feasibility of a parameter file (BPFT, eq. 51).
+    """Test if some point of a feasible set has the base values of a parameter file (BPFT, eq. 51).
 
     Args:
         path: the file.
@@ -206,9 +206,6 @@ def compare_files(paths: Sequence[Path], out: Path | None = None) -> tuple[Compa
     Args:
         paths: two or more.
         out: a file that ends in `.json`, or a folder for everything; nothing is written when None.
-
-    Returns:
-        The comparison, and the files written.
 
     Raises:
         UsageError: fewer than two, one that is not there, or `out` cannot be written.

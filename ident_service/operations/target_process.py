@@ -70,7 +70,7 @@ def watch(folder: Path, target: Target, least: float) -> dict[str, Any] | None:
 
 
 def missed(folder: Path, target: Target, period: float) -> list[dict[str, Any]]:
-    """Return which of the chosen parameters the whole recording of a run does not determine as well as asked.
+    """Return expression and share of the chosen parameters that a run's whole recording leaves less known than asked.
 
     Args:
         folder: folder of the run, which is over.

@@ -78,7 +78,7 @@ class IdleRecording:
 def record_idle(
     arm: Arm, cycles: int, period: float, work: Callable[[Sample], None] = lambda sample: None
 ) -> IdleRecording:
-    """Record cycles of an open arm without torque.
+    """Exchange cycles with an open arm without torque; return their samples and the times of waking.
 
     Args:
         arm: open.

@@ -149,9 +149,6 @@ def point_speeds(model: ArmModel, position: Vector, seconds: Vector, what: str) 
         position: along a motion [rad or m], shape (samples, joints).
         seconds: of the samples [s], shape (samples,).
         what: suffix of the measure's name.
-
-    Returns:
-        One measure; none where no such system is described.
     """
     limit = model.config.point_speed_limit
     if limit is None:

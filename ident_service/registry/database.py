@@ -419,7 +419,7 @@ class Database:
         return next(iter(self.rows(sql, *values)), None)
 
     def known(self, table: str, what: str, name: str, column: str = "id") -> Row:
-        """Return the row of this id, or of another unique column.
+        """Return the row of this id, or of another unique column; raise UnknownId where there is none.
 
         Raises:
             UnknownId: there is none.
@@ -641,6 +641,6 @@ def audit_entries_after(db: Database, line: int, most: int = 500) -> list[Row]:
 
 
 def last_line(db: Database) -> int:
-    """Return the id of the newest line; 0 where there is none."""
+    """Return the id of the newest line of the audit trail; 0 where there is none."""
     row = db.row("SELECT MAX(id) AS id FROM audit")
     return int(row["id"] or 0) if row is not None else 0

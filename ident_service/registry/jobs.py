@@ -49,7 +49,7 @@ def add_job(
 
 
 def known_job(db: Database, job: str) -> Row:
-    """Return the job of this id.
+    """Return the row of the job of this id; raise UnknownId where there is none.
 
     Raises:
         UnknownId: there is none.

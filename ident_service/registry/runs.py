@@ -99,7 +99,7 @@ def rebuild_runs(db: Database, state: Path) -> list[str]:
 
 
 def known_run(db: Database, run: str) -> Row:
-    """Return the run of this id.
+    """Return the row of the run of this id; raise UnknownId where there is none.
 
     Raises:
         UnknownId: there is none.
@@ -108,7 +108,7 @@ def known_run(db: Database, run: str) -> Row:
 
 
 def runs(db: Database, arm: str | None = None, *, before: str | None = None, most: int = 100) -> list[Row]:
-    """Return runs, or those of an arm, the newest first, from the one after the id `before`; raises as `known_run`."""
+    """Return runs, or those of an arm, the newest first, from the one after the id `before`."""
     return db.newest("runs", "run", "created", arm, before, most)
 
 
@@ -142,7 +142,7 @@ def recording_name(db: Database, run: str) -> str:
 
 
 def parameter_set(db: Database, run: str) -> Row | None:
-    """Return the entry of the parameters that a run holds; None where it holds none."""
+    """Return the registry's row on the parameters that a run holds; None where it holds none."""
     return db.row("SELECT * FROM parameter_sets WHERE run = ?", run)
 
 
@@ -211,7 +211,7 @@ def run_files(db: Database, state: Path, run: str) -> dict[str, str]:
 
 
 def run_file(db: Database, state: Path, run: str, name: str) -> Path:
-    """Return the path of a file that the manifest of a run names.
+    """Return the path of a file that the manifest of a run names; raise UnknownId for any other name.
 
     Raises:
         UnknownId: no such run, or no such file in it.
@@ -285,7 +285,7 @@ _ENDED = ("done", "refused")  # a payload job that found no load has files, too
 
 
 def known_export(db: Database, export: str) -> Row:
-    """Return the job that made the export of this id.
+    """Return the row of the job that made the export of this id; raise UnknownId where there is none.
 
     Raises:
         UnknownId: there is none, or it made nothing.
@@ -313,7 +313,7 @@ def export_files(db: Database, state: Path, export: str) -> dict[str, int]:
 
 
 def export_file(db: Database, state: Path, export: str, name: str) -> Path:
-    """Return the path of one file of an export.
+    """Return the path of one file of an export; raise UnknownId where there is no such file.
 
     Raises:
         UnknownId: no such export, or no such file in it.

@@ -71,7 +71,7 @@ def access_refusal(state: Path, *, writing: bool = False) -> str | None:
 
 
 def give_to_owner(state: Path, path: Path) -> None:
-    """Give what root has made in somebody else's state folder to its owner; for acts that are refused to nobody.
+    """Give what root has made in another user's state folder to that user; do nothing unless called by root.
 
     Args:
         state: the state folder.

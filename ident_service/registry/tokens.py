@@ -113,7 +113,7 @@ def sessions(db: Database) -> dict[str, tuple[str, float]]:
 
 
 def digest(secret: str) -> str:
-    """Return the SHA-256 that is stored of a token."""
+    """Return the SHA-256, in hexadecimal digits, that is stored in place of a token."""
     return hashlib.sha256(secret.encode("utf-8", "surrogatepass")).hexdigest()
 
 
@@ -160,7 +160,7 @@ def revoke_first_tokens(db: Database, by: str) -> None:
 
 
 def read_token(path: Path) -> str | None:
-    """Return the token in a file; None without one.
+    """Return the token in a file, None without one; raise UsageError if others than its owner can read it.
 
     Raises:
         UsageError: others than its owner can read it, or it cannot be read.

@@ -106,7 +106,7 @@ class MotionTraces:
     def shares(self, quantity: str) -> Array:
         """Return each joint's largest distance from mid-range over half the range, (joints,), so that 1 is at a limit.
 
-        1 is at a limit. NaN where a joint has no limits on both sides, or the quantity is not given.
+        NaN where a joint has no limits on both sides, or the quantity is not given.
         """
         values = getattr(self, quantity)
         low, high = self.limits(quantity)

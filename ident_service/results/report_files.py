@@ -43,7 +43,7 @@ def write_report(
     validation: Sequence[Recording],
     warnings: Sequence[str],
 ) -> list[str]:
-    """Write evidence and report into a folder that has the other files of the estimate, before its manifest.
+    """Write evidence and report into a folder with the estimate's other files, before its manifest; return names.
 
     Args:
         folder: folder that `write_results` has written.
@@ -51,9 +51,6 @@ def write_report(
         recordings: recordings that were fitted to.
         validation: recordings that were not fitted to.
         warnings: what is wrong with the recordings, in words.
-
-    Returns:
-        The names of the files.
 
     Raises:
         RecordingError: a recording can no longer be read.
@@ -107,9 +104,6 @@ def make_report(folder: Path, out: Path | None = None) -> tuple[Path, Assessment
     Args:
         folder: folder made by `ident identify` or `ident simulate`.
         out: path of the page; in the folder, whose manifest then names it, when None.
-
-    Returns:
-        The page, and the assessment on top of it.
 
     Raises:
         UsageError, ParameterError, ConfigError: the folder is not what its manifest names, or has no evidence.

@@ -207,7 +207,7 @@ class LiveJobs:
             self._jobs[live.job] = live
 
     def enter(self, live: LiveJob) -> None:
-        """Let a job that the registry knows begin when its turn comes; its lease begins."""
+        """Start the lease of a job that is in the registry now, and let it begin when its turn comes."""
         with self._lock:
             live.renewed, live.entered = self._now(), True
         self.changed.set()
@@ -248,12 +248,12 @@ class LiveJobs:
         return ""
 
     def remove(self, live: LiveJob) -> None:
-        """Remove a job that has ended, or was not accepted."""
+        """Remove a job that has ended, or was not accepted, from the queue."""
         with self._lock:
             self._jobs.pop(live.job, None)
 
     def entered(self) -> list[LiveJob]:
-        """Return the jobs that the registry knows."""
+        """Return the live jobs that are in the registry."""
         with self._lock:
             return [live for live in self._jobs.values() if live.entered]
 
@@ -291,7 +291,7 @@ class LiveJobs:
             child.close()
 
     def end_reason(self, job: str) -> str:
-        """Return why a job is to end, empty while it is not; a motion then ends when its arm rests."""
+        """Return why a job has been asked to end, in words; an empty text while nobody has asked."""
         live = self._jobs.get(job)
         return "" if live is None else live.end_reason
 
@@ -308,11 +308,7 @@ class LiveJobs:
         return None if live is None or not live.order.moves else live.by
 
     def renew(self, job: str) -> float | None:
-        """Renew a motion's lease; return how long it lasts now [s], None if nothing moves or waits under it any more.
-
-        Returns:
-            How long it lasts now [s]; None where nothing moves or waits under it any more.
-        """
+        """Renew a motion's lease; return how long it lasts now [s], None if nothing moves or waits under it."""
         with self._lock:
             live = self._jobs.get(job)
             if live is None or not live.order.moves or live.end_reason:
@@ -325,11 +321,7 @@ class LiveJobs:
         return lease
 
     def stop(self, arm: str | None, why: str) -> list[str]:
-        """Ask the motions of an arm, or all if None, to stop, those that wait not to begin; return their ids at once.
-
-        Returns:
-            Their ids.
-        """
+        """Ask the motions of an arm, or all if None, to stop, or not to begin; return their ids at once."""
         with self._lock:
             self._stops[arm] += 1
             found = [one for one in self._jobs.values() if one.order.moves and arm in (None, one.order.arm)]
@@ -546,7 +538,7 @@ class Engine:
         return reached
 
     def progress(self, row: Row) -> Progress | None:
-        """Return the progress of a running job; None for one that does not run."""
+        """Return phase, share done and time left of a running job; None for one that does not run."""
         if row["state"] != "running" or row["started"] is None:
             return None
         typical = rows.typical_seconds(self.db, row["kind"], row["arm"])

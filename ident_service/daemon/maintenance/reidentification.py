@@ -59,7 +59,7 @@ def require_comparable(state: Path, config: ArmConfig) -> int:
 
 
 def known_reidentification(db: Database, name: str) -> Row:
-    """Return the re-identification of this id.
+    """Return the row of the re-identification of this id; raise UnknownId where there is none.
 
     Raises:
         UnknownId: there is none.

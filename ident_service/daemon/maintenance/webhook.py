@@ -84,9 +84,6 @@ class Webhook:
             kind: `arm.due` and so on.
             at: time of the event [s since 1970 in UTC].
             data: JSON values.
-
-        Returns:
-            Its id.
         """
         when = datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
         body = json.dumps({"type": kind, "timestamp": when, "data": dict(data)}, allow_nan=False)

@@ -198,13 +198,13 @@ def acknowledge(service: Serving, who: Operator, arm: ArmName, code: Id) -> answ
 
 @router.post("/arms/{arm}/pause")
 def pause(service: Serving, who: Operator, arm: ArmName) -> answers.AskedAnswer:
-    """Pause the motion of an arm; it keeps its lease."""
+    """Pause the motion of an arm, whose lease is to be renewed meanwhile; return whether a process has the arm."""
     return _ask(service, who.name, arm, "pause")
 
 
 @router.post("/arms/{arm}/resume")
 def resume(service: Serving, who: Operator, arm: ArmName) -> answers.AskedAnswer:
-    """Resume the motion of an arm."""
+    """Resume the paused motion of an arm; return whether a process has the arm."""
     return _ask(service, who.name, arm, "resume")
 
 
@@ -312,7 +312,7 @@ def check(service: Serving, _: Operator, body: Description) -> DescriptionAnswer
 
 @router.get("/arms/{arm}/home")
 def get_home(service: Serving, _: Viewer, arm: ArmName) -> list[HomeJoint]:
-    """Show the posture in which an arm must stand when it is zeroed; refused for other arms."""
+    """Show the home position of each joint, in which an arm must stand for set-home; refused where none is needed."""
     from ident_service.operations.recovery import home_posture
 
     return [HomeJoint(**asdict(one)) for one in home_posture(known.known_arm(service.db, service.state, arm).config)]

@@ -138,7 +138,7 @@ class ViewAnswer(BaseModel):
 def view_arm(
     service: Serving, _: Viewer, request: Request, arm: ArmName, motion: Id | None = None, speed: Speed = 1.0
 ) -> Response:
-    """Return what draws an arm along a motion, the description's `own` or one by its id; without any, at home."""
+    """Return what a viewer draws: an arm along a motion, the description's `own` or one by its id, or at home."""
     config = known.known_arm(service.db, service.state, arm).config
     path = None
     if motion is not None and motion != OWN:
@@ -164,7 +164,7 @@ def get_mesh(service: Serving, _: Viewer, arm: ArmName, sha256: ShortHash, joint
 
 @router.get("/runs/{run}/view", response_model=ViewAnswer)
 def view_run(service: Serving, _: Viewer, request: Request, run: Id, name: FileName | None = None) -> Response:
-    """Return what draws the arm of a run as measured in its recording, the first or one by its name."""
+    """Return what a viewer draws: the arm of a run as measured in its recording, the first or one by its name."""
     there = [one["name"] for one in runs.recordings(service.db, run) if one["deleted"] is None]
     if name is None and not there:
         raise UnknownId(f"the run {run} has no recording")

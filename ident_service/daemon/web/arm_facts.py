@@ -75,7 +75,7 @@ class JointFacts:
 
 
 def arm_facts(state: Path, row: Row) -> ArmFacts:
-    """Return kind, driver and number of joints of an arm in the registry; kind `unreadable` if its file is not."""
+    """Return kind, driver and number of joints of an arm; `unreadable` as kind where its file cannot be read."""
     try:
         path = description_path(state, row)
         return _facts(path, path.stat().st_mtime_ns)

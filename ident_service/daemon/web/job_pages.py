@@ -37,7 +37,7 @@ def list_jobs(service: Serving, who: Viewer, before: Annotated[int, Query(ge=0, 
 
 @router.get("/jobs/{job}")
 def show_job(service: Serving, who: Viewer, job: Id, attended: bool = False) -> Response:
-    """Show one job; `attended` where this page is to keep the lease of its motion."""
+    """Show the page of a job; with `attended` it renews the lease of a motion that the caller began."""
     row = rows.known_job(service.db, job)
     live = row["state"] in rows.LIVE
     attends = attended and live and bool(row["motion"]) and row["created_by"] == who.name and who.role == "operator"

@@ -187,7 +187,7 @@ def begin(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response
 
 @router.get("/reidentifications/{name}")
 def show(service: Serving, who: Viewer, name: Id, attended: bool = False) -> Response:
-    """Show one re-identification; `attended` where this page is to keep its lease."""
+    """Show the page of a re-identification; with `attended` it renews the lease, if the caller began that."""
     row = known_reidentification(service.db, name)
     live, job = row["state"] == "running", None if row["job"] is None else rows.known_job(service.db, row["job"])
     attends = attended and live and not row["unattended"] and row["begun_by"] == who.name and who.role == "operator"

@@ -263,7 +263,7 @@ def _values(found: IdentifiedSet | None, chosen: list[str]) -> list[tuple[float,
 
 @router.get("/runs/{run}")
 def show_run(service: Serving, who: Viewer, run: Id) -> Response:
-    """Show one run."""
+    """Show the page of a run: its facts, parameters, files and report."""
     answer = runs.get_run(service, who, run)
     sets = service.db.rows("SELECT run FROM parameter_sets WHERE arm = ? AND run <> ?", answer.arm, answer.id)
     made = service.db.row("SELECT id FROM jobs WHERE run = ? AND kind <> 'report' ORDER BY number LIMIT 1", answer.id)

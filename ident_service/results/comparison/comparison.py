@@ -73,7 +73,7 @@ class ComparedSet:
 
     @property
     def name(self) -> str:
-        """Return a short name: of the folder, or of the file where it is not called as in a folder of results."""
+        """Return a short name: the folder's, or the file's where that is not called `parameters.json`."""
         path = self.path.absolute()
         return path.parent.name if path.name == PARAMETERS else path.name
 
@@ -174,7 +174,7 @@ class ComparedSet:
 
 
 def read_side(path: Path) -> ComparedSet:
-    """Read a folder of results or a parameter file.
+    """Read and check a folder of results or a parameter file, to be compared.
 
     Raises:
         UsageError: neither is there.
@@ -313,7 +313,7 @@ class Comparison:
 
     @property
     def verdict(self) -> Verdict:
-        """Return `changed` where any side has changed, else `impossible` where any cannot be tested."""
+        """Return `changed` if any side has changed, else `impossible` if any cannot be tested, else `unchanged`."""
         words = [pair.verdict for pair in self.pairs]
         return "changed" if "changed" in words else "impossible" if "impossible" in words else "unchanged"
 

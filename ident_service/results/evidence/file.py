@@ -63,7 +63,7 @@ def unpacked(content: Mapping[str, Any], shape: tuple[int | None, ...]) -> Array
 
 
 def packed_mask(mask: Mask) -> Packed:
-    """Pack a mask of shape (n,)."""
+    """Pack a mask of shape (n,), eight values a byte, in base 64."""
     data = np.packbits(mask, bitorder="little").tobytes()
     return {"bits": len(mask), "data": base64.b64encode(data).decode("ascii")}
 

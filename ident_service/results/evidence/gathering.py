@@ -345,7 +345,7 @@ class Welch:
 
     @property
     def white(self) -> float:
-        """Return the bound that 95 % of the lags of white noise stay below."""
+        """Return the bound that 95 % of the autocorrelations of white noise stay below."""
         return 1.96 / float(np.sqrt(max(self._samples, 1)))
 
 
@@ -429,7 +429,7 @@ class FrictionCollector:
         self._points.add(np.hstack([rows.velocity @ self._coupling.T, drives]))
 
     def found(self) -> tuple[Friction, ...]:
-        """Return the friction of each drive; none where the model has no friction."""
+        """Return the recorded points and the model's curve of each drive's friction; none where it has no friction."""
         if not self._places:
             return ()
         points = self._points.rows()

@@ -343,9 +343,6 @@ def read_c_header(text: str, name: str, function: str, states: dict[str, Array])
         function: `rigid_dynamics`, `friction`, `gravity` or `mass_matrix`.
         states: `q`, `dq` and `ddq`, each of shape (joints, samples).
 
-    Returns:
-        What it writes, shape (values, samples).
-
     Raises:
         ModelError: no such function, or lines that are not generated code.
     """

@@ -282,7 +282,7 @@ FORMATS: dict[str, Callable[[IdentifiedArm], Export]] = {
 
 
 def known_formats(words: str) -> tuple[str, ...]:
-    """Parse formats named in a list with commas, each once.
+    """Parse the names of formats in a list with commas, each once; raise UsageError for unknown ones or none.
 
     Raises:
         UsageError: none, or one that is not there.
@@ -378,7 +378,7 @@ def _implausible(model: ArmModel, delta: Array) -> tuple[str, ...]:
 
 
 def arm_reach(model: ArmModel) -> float:
-    """Return the longest way from the first joint, wherever mounted, along the frames and the last link [m]."""
+    """Return the reach [m]: the longest way from the first joint, wherever mounted, along the frames and last link."""
     chain = model.chain
     ways = np.zeros(chain.joints)
     for k, parent in enumerate(chain.parents):

@@ -44,9 +44,6 @@ def mjcf_export(
         said: statements about its bodies, for a comment in it.
         motion: motion that the arm was identified from, which says how large the torque of what is lost is.
 
-    Returns:
-        The text, and what it does not carry.
-
     Raises:
         ModelError: a link that no real body is, or the file does not say what it should.
     """

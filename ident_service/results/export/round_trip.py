@@ -50,7 +50,7 @@ def disagreement(found: Array, meant: Array) -> float:
 
 
 def torque(model: ArmModel, delta: Array, states: States) -> Array:
-    """Return the torque of an arm with some link parameters at states of shape (samples, joints); same shape."""
+    """Return the torque of link parameters `delta` at some states [N m or N], shape (samples, joints) as the states."""
     return np.asarray(np.einsum("jps,p->sj", joint_regressor(model.chain, model.layout, *states), delta))
 
 

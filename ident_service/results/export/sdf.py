@@ -174,9 +174,6 @@ def sdf_export(
         said: statements about its bodies, for a comment in it.
         motion: motion that the arm was identified from, which says how large the torque of what is lost is.
 
-    Returns:
-        The text, what it does not carry, and notes.
-
     Raises:
         ModelError: a link that no real body is, or the file does not say what it should.
     """

@@ -393,9 +393,6 @@ def urdf_export(
         said: statements about its bodies, for a comment at its end.
         motion: motion that the arm was identified from, which says how large the torque of what is lost is.
 
-    Returns:
-        The text, what it does not carry, and notes.
-
     Raises:
         ModelError: a link has no positive mass, or the file does not say what it should.
     """
