@@ -207,7 +207,7 @@ class IdentClient(Connection):
         return _job(self.get(f"{_API}/jobs/{_word(job)}"))
 
     def events(self, *, after: int | None = None, samples: bool = False) -> Iterator[Event]:
-        """Yield the events of all arms and jobs until the caller stops iterating.
+        """Yield the events of all arms and jobs, reconnecting where the stream breaks, until the caller stops.
 
         After a broken connection the stream is resumed where it broke off, so that no event is missed or repeated.
 

@@ -155,7 +155,7 @@ def acceptances(state: Path, arm: str) -> list[Acceptance]:
 
 
 def accepted_set(state: Path, arm: str, number: int | None = None) -> tuple[Acceptance, Path]:
-    """Return an acceptance and the folder with its files; the current one if `number` is None.
+    """Return (acceptance, folder with its files, which are verified); the current one if `number` is None.
 
     Raises:
         UsageError: nothing was accepted, or nothing of this number.

@@ -237,7 +237,7 @@ def simulate(
     step: Step = lambda words, share: None,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> Commissioning:
-    """Commission the simulated arm of a configuration, and score the result against its true parameters.
+    """Run both motions on the simulated arm, identify it, write the run folder, and score it against the truth.
 
     Args:
         config: configuration with a simulated driver.

@@ -125,7 +125,7 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str 
 
 
 def release_held_drives(config: ArmConfig, state: Path) -> tuple[str, ...]:
-    """Switch off drives that hold an arm in quick stop, once a person has confirmed that it is supported.
+    """Switch off drives that hold an arm in quick stop, which a person has confirmed as supported; return the axes.
 
     Args:
         config: of the arm.

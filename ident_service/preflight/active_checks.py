@@ -424,7 +424,7 @@ REMEDY = (
 
 
 def holdable(gravity: Vector, model: ArmModel, limits: MotionLimits) -> Check | None:
-    """Return a failed check where the model says that the arm cannot be held in this posture; else None.
+    """Return a failed check if the model's gravity torque takes too much of a torque limit; else None.
 
     Args:
         gravity: the model's torque where the arm stands [N m or N], shape (joints,).

@@ -118,7 +118,7 @@ class MotionTraces:
 
 
 def joints_over_time(traces: MotionTraces, title: str = "Motion of the joints") -> str:
-    """Draw position, velocity, acceleration and torque over time as far as given, one row per joint.
+    """Draw position, velocity, acceleration and torque over time as far as given, a row per joint; return the SVG.
 
     Args:
         traces: the motion and its limits.

@@ -100,7 +100,7 @@ def require_confirmed(service: Service, arm: str, confirm: Confirmation | None, 
 def create_job(
     service: Serving, who: Operator, body: JobRequest, response: Response, idempotency_key: Key = None
 ) -> answers.JobAnswer:
-    """Begin or queue a job; a computation repeated with the same `Idempotency-Key` is the same job."""
+    """Begin or queue a job, a motion only if confirmed; a computation with an `Idempotency-Key` is queued once."""
     if idempotency_key is None:
         return begin_job(service, who, body)
     if body.job.kind in MOVES:
@@ -179,7 +179,7 @@ async def watch_job(service: Serving, _: Viewer, while_known: WhileAuthorized, j
 
 @router.post("/jobs/{job}/cancel")
 def cancel_job(service: Serving, who: Operator, job: Id) -> answers.JobAnswer:
-    """Cancel a job; a motion comes to a controlled stop, and the job then says what happened."""
+    """Cancel a job, without waiting; a motion comes to a controlled stop, and the job then says what happened."""
     service.engine.cancel(job, who.name)
     return job_answer_document(service, rows.known_job(service.db, job))
 
@@ -203,7 +203,7 @@ async def renew_lease(service: Serving, who: LeaseKeeper, job: Id) -> answers.Le
 
 @router.post("/stop")
 async def stop_all(service: Serving, who: Near) -> answers.StopAnswer:
-    """Stop all arms, under control; needs no lease and no role; on the service's own machine no token either."""
+    """Stop all arms, under control, without waiting; needs no role, on the service's own machine no token."""
     return await _stop(service, None, who)
 
 

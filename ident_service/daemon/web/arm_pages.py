@@ -344,13 +344,13 @@ def _upcoming(service: Service, row: Row, facts: ArmFacts) -> Step | None:
 
 @router.get("/arms/{arm}/picture.svg")
 def show_picture(service: Serving, _: Viewer, arm: ArmName) -> Response:
-    """Draw an arm at home."""
+    """Draw an arm at home, as an SVG."""
     return picture(home_svg(service, arm))
 
 
 @router.get("/arms/{arm}/motion.svg")
 def show_motion(service: Serving, _: Viewer, arm: ArmName, motion: Id | Literal[""] = "") -> Response:
-    """Draw an arm along a motion, the description's own if none is named."""
+    """Draw an arm along a motion, the description's own if none is named, as an SVG."""
     return picture(motion_svg(service, arm, motion))
 
 
@@ -425,7 +425,7 @@ def move(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
 
 @router.post("/arms/{arm}/jobs")
 def compute(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
-    """Queue a job that moves nothing."""
+    """Queue a job that moves nothing, and go to its page."""
     if form.get("kind") not in _KINDS:
         raise UsageError("choose an action on the page of the arm")
     job = jobs.begin_job(service, who, jobs.JobRequest.model_validate({"job": _requested_job(arm, form)}))
@@ -434,7 +434,7 @@ def compute(service: Serving, who: Operator, arm: ArmName, form: Form) -> Respon
 
 @router.post("/arms/{arm}/ack")
 def acknowledge(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
-    """Acknowledge a fault that a person has read."""
+    """Acknowledge a fault that a person has read, and go back to the page of the arm."""
     arms.acknowledge(service, who, arm, form.get("code", ""))
     return see_other(f"/arms/{arm}")
 

@@ -81,7 +81,7 @@ def viewer_page() -> HTMLResponse:
 
 
 def viewer_file() -> bytes:
-    """Read the viewer's script."""
+    """Return the viewer's script."""
     return _vendored().joinpath(VIEWER).read_bytes()
 
 

@@ -303,7 +303,7 @@ def label(service: Serving, who: Operator, run: Id, form: Form) -> Response:
 
 @router.get("/overlay")
 def overlay(service: Serving, who: Viewer, run: Annotated[list[Id] | None, Query(max_length=50)] = None) -> Response:
-    """Show the recordings of several runs over each other."""
+    """Show the recordings of several runs of the same joints over each other; any other choice is refused."""
     chosen = list(dict.fromkeys(run or ()))
     if not 2 <= len(chosen) <= _OVERLAID:
         raise UsageError(

@@ -74,7 +74,7 @@ def load(version: str, name: str) -> Response:
 
 @router.post("/stop")
 async def stop(service: Serving, request: Request, near: Near, cookie: Cookie = None) -> Response:
-    """Bring all arms to a controlled stop; the same callers may as for the API's stop."""
+    """Bring all arms to a controlled stop and show a page of those reached; whoever may by the API may here."""
     done = await stop_all(service, near)
     back = inside(urlsplit(request.headers.get("referer", "")).path or "/")
     who = service.authenticator.known(None, cookie)

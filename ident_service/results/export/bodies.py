@@ -30,7 +30,7 @@ def about_origin(mass: float, center: Array, inertia: Array) -> Array:
 
 
 def is_real(parameters: Array) -> bool:
-    """Return whether some distribution of positive mass has these parameters."""
+    """Return whether some positive mass distribution has these parameters, by second moments about its centre."""
     mass = parameters[9]
     if not mass > 0.0:
         return False
