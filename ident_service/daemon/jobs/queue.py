@@ -171,7 +171,7 @@ class LiveJobs:
         self._thread = threading.Thread(target=self._keep_leases, name="leases", daemon=True)
 
     def start(self) -> None:
-        """Start the thread that watches leases."""
+        """Start the thread that stops motions whose lease is not renewed."""
         self._thread.start()
 
     def close(self) -> None:
@@ -180,7 +180,7 @@ class LiveJobs:
 
     @property
     def healthy(self) -> bool:
-        """Return whether the thread that watches leases is alive."""
+        """Return whether the thread that stops motions whose lease is not renewed is alive."""
         return self._thread.is_alive()
 
     def add(self, live: LiveJob, stops: int | None = None) -> None:
