@@ -74,7 +74,7 @@ class IdentifiedSet:
 
     @property
     def rows(self) -> list[tuple[str, str, float, float | None, str]]:
-        """Return expression, unit, value, deviation and verdict of each base parameter, the least certain first."""
+        """Return (expression, unit, value, deviation, verdict) of each base parameter, unidentified ones first."""
         table = zip(self.expressions, self.units, self.values, self.deviations, self.verdicts, strict=True)
         order = {"unidentified": 0, "weak": 1}
         return sorted(table, key=lambda row: (order.get(row[4], 2), -abs((row[3] or 0.0) / (row[2] or 1.0))))
