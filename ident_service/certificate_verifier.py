@@ -88,7 +88,7 @@ class VerificationError(ValueError):
 
 
 def rational(text: str) -> Fraction:
-    """Read a decimal (`-1.5e-3`) or a fraction (`-2/3`), digit for digit.
+    """Parse a decimal (`-1.5e-3`) or a fraction (`-2/3`) into an exact Fraction; any other text raises.
 
     Raises:
         VerificationError: neither, or of more than `MAX_NUMBER_CHARACTERS` characters.
@@ -104,7 +104,7 @@ def rational(text: str) -> Fraction:
 
 
 def rational_text(value: Fraction) -> str:
-    """Write a decimal where the number has a finite one, else a fraction; `rational` reads back the same number.
+    """Format a number as a decimal where it has a finite one, else as `a/b`; `rational` reads back the same number.
 
     Raises:
         VerificationError: more than `MAX_NUMBER_CHARACTERS` characters.
@@ -135,7 +135,7 @@ def rational_text(value: Fraction) -> str:
 
 
 def exact_sum(terms: Iterable[Fraction]) -> Fraction:
-    """Add up.
+    """Return the exact sum of the terms; raise VerificationError once its denominator has too many bits.
 
     Raises:
         VerificationError: numbers grow beyond what a real proof needs.
@@ -149,7 +149,7 @@ def exact_sum(terms: Iterable[Fraction]) -> Fraction:
 
 
 def split_name(name: str) -> tuple[str, int]:
-    """Split the name of a link parameter into symbol and link number.
+    """Split the name of a link parameter, such as `Lxx1`, into symbol and link number; any other name raises.
 
     Raises:
         VerificationError: no name of a link parameter; the message says which are.
@@ -164,7 +164,7 @@ def split_name(name: str) -> tuple[str, int]:
 
 
 def parse_expression(text: str) -> Row:
-    """Read the coefficients of a sum by name, decimals as they are written; nothing is evaluated.
+    """Parse a sum such as `m1 + 2*(lx2 - 0.5*m2)` into the exact coefficient of each name; nothing is evaluated.
 
     The grammar, of which any name is read here::
 
@@ -258,12 +258,12 @@ class _Parser:
 
 
 def triangle(size: int) -> list[tuple[int, int]]:
-    """List row and column of each entry of an upper triangle, column by column."""
+    """List (row, column), from 0, of each entry of an upper triangle, column by column."""
     return [(i, j) for j in range(size) for i in range(j + 1)]
 
 
 def symmetric(entries: Sequence[Fraction], size: int) -> Matrix:
-    """Build the symmetric matrix with this upper triangle, column by column."""
+    """Build the symmetric matrix whose upper triangle has these entries, listed column by column."""
     matrix = [[Fraction(0)] * size for _ in range(size)]
     for value, (i, j) in zip(entries, triangle(size), strict=True):
         matrix[i][j] = matrix[j][i] = value
@@ -271,7 +271,7 @@ def symmetric(entries: Sequence[Fraction], size: int) -> Matrix:
 
 
 def is_positive_definite(matrix: Matrix) -> bool:
-    """Tell if every pivot of L D L^T is positive.
+    """Tell if a symmetric matrix is positive definite: every pivot of its exact L D L^T is positive.
 
     Raises:
         VerificationError: numbers grow beyond what a real proof needs.
@@ -280,7 +280,7 @@ def is_positive_definite(matrix: Matrix) -> bool:
 
 
 def is_positive_semidefinite(matrix: Matrix) -> bool:
-    """Tell if no pivot of L D L^T is negative and each zero pivot stands in a zero row.
+    """Tell if a symmetric matrix is positive semidefinite: no pivot of L D L^T < 0, each zero pivot in a zero row.
 
     Raises:
         VerificationError: numbers grow beyond what a real proof needs.
@@ -305,7 +305,7 @@ def _pivots(matrix: Matrix) -> Iterator[tuple[Fraction, bool]]:
 
 
 def dependent_row(rows: Sequence[Mapping[str, Fraction]]) -> int | None:
-    """Find the first row that is a combination of those before it, by elimination modulo a prime.
+    """Return the index of the first row that is a combination of those before it modulo a prime; None if none is.
 
     Rows that are independent modulo a prime are independent. The converse fails for one table in 10^18, or for one made
     so on purpose, which then is refused.
@@ -346,7 +346,7 @@ class Affine:
     constant: Fraction = Fraction(0)
 
     def at(self, values: Mapping[str, Fraction]) -> Fraction:
-        """Return its value; KeyError where a parameter has none."""
+        """Return constant plus sum of coefficient times value, exactly; KeyError where a parameter has no value."""
         return exact_sum((self.constant, *(c * values[name] for name, c in self.coefficients.items())))
 
     def __str__(self) -> str:
@@ -374,7 +374,7 @@ class ExactBlock:
     entries: tuple[Affine, ...]
 
     def is_positive(self, values: Mapping[str, Fraction]) -> bool:
-        """Tell if the condition holds strictly, decided exactly."""
+        """Tell if the matrix at these values is positive definite, exactly; with size 0, if every entry is positive."""
         entries = [entry.at(values) for entry in self.entries]
         if self.size == 0:
             return all(entry > 0 for entry in entries)
@@ -382,7 +382,7 @@ class ExactBlock:
 
 
 def set_blocks(kind: Kind, link: int) -> ExactBlock:
-    """Build the condition on the inertia of one link: eq. 17 as printed, or [[tr(L)/2 1 - L, l], [l^T, m]].
+    """Build the matrix of one link that must be positive definite: eq. 17 for `inertia`, else the pseudo-inertia.
 
     It is written down here a second time, from the formulas, so that a proof does not rest on the solver's arrays.
 
@@ -546,7 +546,7 @@ _EQUALITY_FORMS: tuple[tuple[str, Form], ...] = (
 
 
 def is_assumed(name: str) -> bool:
-    """Tell if a condition is a bound that a disproof assumes, which no description holds."""
+    """Tell if a condition's name begins with `assumed: `: a bound that a disproof assumes, no description's."""
     return name.startswith("assumed: ")
 
 
@@ -627,12 +627,12 @@ class Claim:
 
     @property
     def implied(self) -> frozenset[str]:
-        """Return the names of the conditions that the set itself consists of."""
+        """Return the names of the conditions on each link's inertia, of which the feasible set itself consists."""
         return frozenset(block.name for block in self.blocks[: len(self.links)])
 
 
 def read_claim(document: dict[str, object], certificate: dict[str, object]) -> Claim:
-    """Read what the certificate is about: the file's base parameters, and the conditions of its set and list.
+    """Parse and check what a certificate is about: the file's base parameters, and the conditions of its set and list.
 
     Raises:
         VerificationError: anything missing, contradictory, foreign or larger than a real one.
@@ -718,7 +718,7 @@ def _block(item: object) -> ExactBlock:
 
 
 def load(content: str, what: str = "a parameter file") -> dict[str, object]:
-    """Read the file's objects and lists, its numbers as the texts they are written as.
+    """Parse a JSON object, its numbers kept as the texts they are written as; any other content raises.
 
     Args:
         content: the text.
@@ -806,7 +806,7 @@ def _link(value: object) -> int:
 
 
 def clean(text: str) -> str:
-    """Make one printable line of at most 500 characters: a file may hold anything, and a terminal gets it."""
+    """Return the first 500 characters, each unprintable one as `?`: a file may hold anything."""
     return _printable(text)[:500]
 
 
@@ -843,12 +843,12 @@ class Verification:
 
     @property
     def about_parameters(self) -> bool:
-        """Return whether the file is one of parameters at all; any other cannot be used, and is exit code 2."""
+        """Return False only for a failed verdict on a file that is no parameter file at all, which is exit code 2."""
         return not (self.verdict == "failed" and self.message.startswith(_NO_PARAMETERS))
 
 
 def verify(content: str, arm: Arm | None = None) -> Verification:
-    """Check the certificate of a parameter file; never raises, whatever the text is.
+    """Check the certificate in a parameter file's text and return the verdict; a bad text is `failed`, never raised.
 
     Args:
         content: the text of `parameters.json`.
@@ -1205,7 +1205,7 @@ def _require_names(given: frozenset[str], wanted: frozenset[str], where: str) ->
 
 
 def read_file(path: Path) -> str:
-    """Read a text of bounded size.
+    """Return the text of a UTF-8 file; raise if it is longer than `MAX_FILE_CHARACTERS` bytes, or a device or pipe.
 
     Raises:
         OSError: it cannot be read, or is a device or pipe, which may never end.
@@ -1224,7 +1224,7 @@ def read_file(path: Path) -> str:
 
 
 def require_folder(folder: Path) -> None:
-    """Hold the files of a folder of results against its manifest, and its arm against its parameters.
+    """Raise unless a results folder's files are those of its manifest, and its parameters those of its arm.
 
     Raises:
         OSError: a file cannot be read, or `parameters.json` is not there.
@@ -1269,7 +1269,7 @@ _WITHOUT_MANIFEST = "there is no manifest.json, so the other files of the folder
 
 
 def verify_path(path: Path, arm: Arm | None = None) -> Verification:
-    """Check the certificate of a parameter file, or of the one in a folder of results.
+    """Check the certificate of a parameter file or a folder of results; return the verdict, `failed` for a bad one.
 
     Args:
         path: file or folder.
@@ -1290,7 +1290,7 @@ def verify_path(path: Path, arm: Arm | None = None) -> Verification:
 
 
 def answer_text(path: Path, answer: Verification) -> str:
-    """Write the answer as lines for a person, the last with its line break.
+    """Format a verification as lines for a person: file and verdict or message, what was checked, notes.
 
     Where no arm was given, the first word is about the file and not about parameters.
     """
@@ -1301,7 +1301,7 @@ def answer_text(path: Path, answer: Verification) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Check a file or folder named on the command line.
+    """Check the file or folder named on the command line, print the verdict, and return the exit code 0, 2 or 3.
 
     Returns:
         0: consistent with its own conditions, and these can be met. 3: not so. 2: the file cannot be read, or is

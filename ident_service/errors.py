@@ -150,7 +150,7 @@ BOUNDS: Mapping[str, tuple[str, str]] = MappingProxyType(
 
 
 def plain_mistake(mistake: Mapping[str, Any]) -> str:
-    """Return the message of one mistake that pydantic found, without the pattern of a text, which is for programs.
+    """Return one mistake found by pydantic as words for a person, without a pattern, which is for programs.
 
     Args:
         mistake: one item of `ValidationError.errors()`: `type`, `msg`, `input` and `ctx`.

@@ -94,13 +94,10 @@ _EXIT_CODES: tuple[tuple[type[IdentError] | tuple[type[IdentError], ...], int], 
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb.
+    """Run the verb that `ident` was called with, print its answer or error, and return the exit code.
 
     Args:
         argv: the words after `ident`; those of the process if None.
-
-    Returns:
-        The exit code.
 
     Raises:
         SystemExit: with 0 after help or version, with 2 after words that no verb understands.
@@ -255,7 +252,7 @@ def _refused(arguments: argparse.Namespace, error: OSError) -> IdentError | None
 
 @cache  # parsing leaves it as it was
 def parser(verb: str | None = None) -> Parser:
-    """Return the argument parser with all verbs and their arguments.
+    """Build the argument parser of `ident`, with all verbs, or only those of the given verb's group; cached.
 
     Args:
         verb: verb to be parsed, for a parser with the verbs of its group alone; all groups where none has it.

@@ -21,12 +21,12 @@ Values = Mapping[str, Any]
 
 
 def told(arguments: argparse.Namespace, document: dict[str, Any], code: int = DONE) -> Answer:
-    """Return the answer of a verb with the text of its values."""
+    """Return a verb's answer: (exit code, text that the verb's formatter makes of the document, document)."""
     return code, _TEXTS[arguments.word](document), document
 
 
 def stop_text(arm: str | None, reached: Sequence[str], cancelled: Sequence[str] = ()) -> str:
-    """Format the arms that a stop of an arm, or of all, has reached, and the daemon's jobs that it has cancelled."""
+    """Format the line that says which arms a stop reached and which jobs it cancelled, or that nothing moves."""
     parts = [f"stop requested of {', '.join(reached)}"] if reached else []
     parts += [f"cancelled: {', '.join(f'job {job}' for job in cancelled)}"] if cancelled else []
     nobody = "no arm is moving" if arm is None else f"{arm} is not moving"
@@ -34,12 +34,12 @@ def stop_text(arm: str | None, reached: Sequence[str], cancelled: Sequence[str] 
 
 
 def asked_text(arm: str, asked: str) -> str:
-    """Format what the process that moves an arm was asked."""
+    """Format the line that confirms a request to a moving arm's process: `pause`, `resume`, `finish` or `supported`."""
     return f"{arm}: {_ASKED[asked]}\n"
 
 
 def reidentified_text(comparison: str, state: str, words: str) -> str:
-    """Format the verdict of a re-identification after the text of its comparison."""
+    """Join a comparison's text and the verdict's words; if `state` is `changed`, add that an alarm is open."""
     opened = "a drift alarm is open until `ident alarms acknowledge`, or `ident accept` of another set\n"
     return f"{comparison}{words}\n{opened if state == 'changed' else ''}"
 

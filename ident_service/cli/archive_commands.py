@@ -35,7 +35,7 @@ def add_by(sub: Parser) -> None:
 
 
 def terminal_user(arguments: argparse.Namespace) -> str:
-    """Return the audit-trail name `terminal:NAME` of the person at the terminal; no token has such a name.
+    """Return `terminal:NAME` for the audit trail, NAME from `--by` or else the login name; no token has such a name.
 
     Raises:
         UsageError: no name.
@@ -71,7 +71,7 @@ def registry(arguments: argparse.Namespace, *, arms: bool = True) -> Iterator[tu
 
 
 def write_audit_entry(arguments: argparse.Namespace, what: str, about: str, **detail: Any) -> None:
-    """Enter an act that was done at a terminal in the audit trail, where the state folder has one.
+    """Write to the audit trail what was done at a terminal; no registry: nothing; one that fails: later. Never raises.
 
     It has been done already: a registry that is kept or full changes nothing, and the line is entered later.
 
@@ -287,7 +287,7 @@ def _delete(arguments: argparse.Namespace) -> Answer:
 
 @contextmanager
 def deleted_with_anyway(kind: str, name: str) -> Iterator[None]:
-    """Add to an error that refuses the deletion in the block the command that deletes anyway."""
+    """Re-raise an InUse error of the block that lists dependents, with the command that deletes all the same added."""
     try:
         yield
     except InUse as error:

@@ -93,7 +93,7 @@ class Parser(argparse.ArgumentParser):
         self._intermixing = False  # while arguments are parsed again, options first
 
     def error(self, message: str) -> NoReturn:
-        """Print the message and where help is, and raise.
+        """Print the message and where help is to stderr, and raise ArgumentsError.
 
         Raises:
             ArgumentsError: always.
@@ -105,7 +105,7 @@ class Parser(argparse.ArgumentParser):
         raise ArgumentsError(message)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse arguments; refuse what this verb does not know in its own name, not in that of `ident`.
+        """Parse as argparse does, but raise ArgumentsError, in this verb's name, for unknown arguments.
 
         Before Python 3.12.7, argparse alone takes a positional argument that may be left out only before options.
         """
@@ -183,7 +183,7 @@ class TopParser(Parser):
     """Parser of `ident` itself, whose help lists the verbs in groups."""
 
     def error(self, message: str) -> NoReturn:
-        """Print the whole help where no verb was given, then as every parser.
+        """Print the message, after the whole help where no verb was given, to stderr, and raise ArgumentsError.
 
         Raises:
             ArgumentsError: always.
@@ -223,7 +223,7 @@ class VerbList:
 
     @classmethod
     def of(cls, parser: Parser) -> VerbList:
-        """Create the list of verbs of a command."""
+        """Add subcommands to a parser and return their list, which is still empty."""
         return cls(parser.add_subparsers(required=True, metavar="VERB", action=_Verbs, parser_class=Parser), parser)
 
     def add(
@@ -238,7 +238,7 @@ class VerbList:
         hidden: bool = False,
         word: str | None = None,
     ) -> Parser:
-        """Add a verb.
+        """Add a verb with its help and the function that runs it; return its parser, to add arguments to.
 
         Args:
             name: the word.
@@ -250,9 +250,6 @@ class VerbList:
             former: the verb's earlier name, which is still understood and not listed.
             hidden: leave the verb out of the list of verbs.
             word: the verb that a hidden one stands for.
-
-        Returns:
-            Its parser, to add arguments to.
         """
         word = word or f"{self.prefix}{name}"
         if not hidden:
@@ -280,7 +277,7 @@ class VerbList:
         former: str | None = None,
         hidden: bool = False,
     ) -> VerbList:
-        """Add a noun that is followed by verbs of its own, as in `ident config check`.
+        """Add a noun followed by verbs of its own, as in `ident config check`; return the list to add these verbs to.
 
         Args:
             name: the noun.
@@ -321,7 +318,7 @@ def _answer(parser: Parser, word: str, run: Callable[[argparse.Namespace], Answe
 
 
 def add_arm(sub: argparse.ArgumentParser, *, optional: bool = False, motion: bool = False) -> None:
-    """Add the description of an arm to a verb, and with `motion` the motion that it may follow."""
+    """Add the argument ARM to a verb, and with `motion` an optional argument MOTION, a file."""
     text = "description file, or the name of a shipped one"
     sub.add_argument("arm", nargs="?" if optional else None, metavar="ARM", help=text)
     if motion:
@@ -335,7 +332,7 @@ def repeatable(sub: Parser, option: str, metavar: str, text: str, read: Callable
 
 
 def columns_files(given: Sequence[str]) -> tuple[Path | None, dict[Path, Path]]:
-    """Separate the columns file of all recordings from those of single recordings.
+    """Split `--columns` values into (file for all recordings or None, {recording: its own file}).
 
     Args:
         given: values of `--columns`, `FILE` or `RECORDING=FILE`.
@@ -364,7 +361,7 @@ def columns_files(given: Sequence[str]) -> tuple[Path | None, dict[Path, Path]]:
 
 
 def payload_files_of(given: Sequence[str]) -> dict[Path, Path]:
-    """Return the file of the known payload of each recording.
+    """Map each recording to the file of its known payload, from `--payload` values `RECORDING=FILE`.
 
     Args:
         given: values of `--payload`, `RECORDING=FILE`.
@@ -421,5 +418,5 @@ _delay = _number("a delay is a number of seconds below 1, 'estimate' or 'choose'
 
 
 def delay(text: str) -> float | str:
-    """Parse a delay [s] of less than 1 s in magnitude, or `estimate` or `choose`."""
+    """Parse a delay [s] below 1 s in magnitude to a float; return `estimate` and `choose` as they are."""
     return text if text in ("estimate", "choose") else _delay(text)

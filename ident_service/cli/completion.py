@@ -26,7 +26,7 @@ _JOBS, _UPLOADED = "SELECT id FROM jobs ORDER BY number DESC LIMIT 50", "SELECT 
 
 
 def install_completion(shell: str, *, install: bool) -> tuple[str, Path | None]:
-    """Return the script by which a shell completes `ident`, and where it was written if that was asked for.
+    """Return (completion script for a shell, file that it was written to); None for the file without `install`.
 
     Args:
         shell: `bash`, `zsh` or `fish`.
@@ -52,7 +52,7 @@ def install_completion(shell: str, *, install: bool) -> tuple[str, Path | None]:
 
 
 def complete(top: Parser) -> None:
-    """Answer a shell's request at the file descriptor that it reads, and end the process."""
+    """Answer a shell's completion request and end the process; return if this process was not started for one."""
     import argcomplete
 
     for parser in _prune(top):

@@ -191,7 +191,7 @@ class _Package(ModuleType):
 
 @contextmanager
 def quick_imports() -> Iterator[None]:
-    """Load parts of packages as they are asked for, and look for garbage hardly ever, while a command runs.
+    """Import large packages lazily, collect garbage rarely and load no pydantic plugins during the block.
 
     Modules make objects that stay, and looks at them are a twentieth of the time.
     """
@@ -776,6 +776,6 @@ def _view(arguments: argparse.Namespace) -> Answer:
 
 
 def add(verbs: VerbList) -> None:
-    """Register the verbs of this module."""
+    """Register the verbs about commissioning, fleets, comparing, parameters, exports and results."""
     for register in (_add_commission, _add_fleet, _add_comparing, _add_parameters, _add_exports, _add_results):
         register(verbs)

@@ -143,7 +143,7 @@ def run_and_report(
     stop_requested: Callable[[], bool],
     until: Target | None = None,
 ) -> Answer:
-    """Move the arm along a motion or to a destination, and return the answer of the verb.
+    """Run a motion, or go to a destination, by the arm's preflight ticket; record it and return the verb's answer.
 
     Args:
         arguments: arguments of the verb, with `out`, `state` and `can_log`.
@@ -262,7 +262,7 @@ def described_arm(arguments: argparse.Namespace) -> ArmConfig:
 
 
 def dry_run(arguments: argparse.Namespace, *, zero: bool = False) -> Answer:
-    """Return what opening the arm of a verb, or zeroing it, would write into its drives; nothing is written."""
+    """Return the answer that lists what opening the arm, or set-home if `zero`, would write to its drives."""
     from ident_service.operations.drive_configuration import (
         drives_document,
         planned_configuration,
@@ -283,7 +283,7 @@ def add_can_log(sub: Parser) -> None:
 
 
 def require_terminal(arguments: argparse.Namespace) -> int:
-    """Return the file descriptor of the terminal whose key is to be held.
+    """Return stdin's file descriptor, at which a key can be held; raise UsageError with `--json` or without a terminal.
 
     Raises:
         UsageError: a program is asking, or standard input is no terminal.
@@ -297,7 +297,7 @@ def require_terminal(arguments: argparse.Namespace) -> int:
 
 
 def require_held(arguments: argparse.Namespace, arm: str, key: HeldKey, stopping: StopOnSignal) -> None:
-    """Ask a person to hold the key, and wait until it is held.
+    """Ask a person to hold the space bar and wait until it is held; raise MotionRefused on its release or a stop.
 
     Raises:
         MotionRefused: it was not.
@@ -598,7 +598,7 @@ def _move(arguments: argparse.Namespace, share_of_speed: float, seconds: float |
 
 
 def require_no_target(arguments: argparse.Namespace) -> None:
-    """Refuse an accuracy target of a run that ends when a key is released.
+    """Raise UsageError if `--until` or `--parameter` was given, which a run by a held key does not take.
 
     Raises:
         UsageError: `--until` or `--parameter` was given.

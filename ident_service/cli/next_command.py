@@ -44,7 +44,7 @@ class Ended:
 
     @property
     def good(self) -> bool:
-        """Return whether it was done and good."""
+        """Return whether the verb ended with exit code 0."""
         return self.code == DONE
 
     @property
@@ -54,17 +54,17 @@ class Ended:
 
     @property
     def motion(self) -> list[str]:
-        """Return the motion as the verb named it, as arguments; none for that of the description."""
+        """Return the verb's motion argument as a list of one word; empty for the description's own motion."""
         motion = getattr(self.given, "motion", None)
         return [] if motion is None else [self.short(motion)]
 
     @property
     def remote(self) -> bool:
-        """Return whether a daemon did it."""
+        """Return whether a daemon carried out the verb, by `--server`."""
         return getattr(self.given, "server", None) is not None
 
     def short(self, path: str | Path) -> str:
-        """Return the id of a run or motion of the state folder, by which verbs know it too; other paths as they are."""
+        """Return the id of a run or motion in the state folder, which verbs take too; other paths as they are."""
         path = Path(path)
         place = path.parent if path.name == "motion.json" else path
         registered = place.parent.name in ("runs", "motions") and place.parent.parent == state_folder(self.given)
@@ -75,7 +75,7 @@ Follows = Callable[[Ended], Sequence[str] | None]
 
 
 def next_line(arguments: argparse.Namespace, code: int, document: Mapping[str, Any]) -> str:
-    """Return the line that names the next command, with its line break; empty where there is none."""
+    """Return the line `next: ident ...`, the command to type after this answer; empty where there is none."""
     follows = _FOLLOWS.get(arguments.word)
     job = document.get("job") if isinstance(document.get("job"), dict) else None
     said = document if job is None else {**(document.get("answer") or {}), "job": job}
@@ -102,7 +102,7 @@ def _job_refusal(arguments: argparse.Namespace, said: Mapping[str, Any]) -> str:
 
 
 def next_after_error(arguments: argparse.Namespace, kind: type[IdentError], message: str) -> str:
-    """Return the line that names the command which clears what stopped or refused a motion; empty for other errors."""
+    """Return the line `next: ident ...`, the command that clears a fault or refusal; empty for other errors."""
     arm = getattr(arguments, "arm", None)
     if arguments.word == "reidentify" and "nothing has been accepted" in message:
         return f"next: {command(arguments, ['preflight', str(arm)])}\n"
@@ -122,7 +122,7 @@ def next_after_error(arguments: argparse.Namespace, kind: type[IdentError], mess
 
 
 def with_arm(arguments: argparse.Namespace, text: str) -> str:
-    """Return text for a person whose commands name the arm as the arguments do, instead of ARM."""
+    """Replace ARM in the commands of a text for a person by the arm that the arguments name; no change without one."""
     arm = getattr(arguments, "arm", None)
     if not isinstance(arm, str):
         return text
@@ -130,7 +130,7 @@ def with_arm(arguments: argparse.Namespace, text: str) -> str:
 
 
 def command(arguments: argparse.Namespace, words: Sequence[str]) -> str:
-    """Return a command as it is typed, for the state folder or daemon that the arguments of another name."""
+    """Return the shell line `ident WORDS`, with the `--state` and `--server` that the arguments have."""
     more = [] if arguments.state is None or "--state" in words else ["--state", arguments.state]
     local = words[0] in LOCAL_ONLY or " ".join(words[:2]) in LOCAL_ONLY
     more += [] if getattr(arguments, "server", None) is None or local else ["--server", arguments.server]

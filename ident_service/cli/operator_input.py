@@ -46,7 +46,7 @@ class StdinLease:
         self._over = ""
 
     def over(self) -> bool:
-        """Return whether the lease has ended, so that the arm is to stop; once ended, it stays so."""
+        """Read stdin without waiting; return whether silence, end of input or `stop` has ended the lease."""
         if not self._over:
             self._look()
         return bool(self._over)
@@ -79,7 +79,7 @@ class StdinLease:
 
 
 def add_lease(sub: Parser, *, confirm: bool = True) -> None:
-    """Add the lease options to a verb that moves an arm; `--confirm` too, unless the verb has its own."""
+    """Add `--lease-from-stdin`, and unless `confirm` is False also `--confirm`, to a verb that moves an arm."""
     if confirm:
         sub.add_argument("--confirm", metavar="NAME", help="with --server: the arm's name, typed by a person")
     sub.add_argument(

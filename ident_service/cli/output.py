@@ -30,9 +30,9 @@ _STYLES = {"error": "1;31", "heading": "1", "next": "36"}
 
 
 def styled(stream: TextIO | None, text: str, style: str) -> str:
-    """Return text in the style `error`, `heading` or `next` where the stream is a terminal that shows colours.
+    """Return text in the colour of `error`, `heading` or `next` on a terminal that shows colours, else unchanged.
 
-    They are left out in pipes and files, in a terminal called `dumb`, and where `NO_COLOR` is set (no-color.org).
+    Colours are left out in pipes and files, in a terminal called `dumb`, and where `NO_COLOR` is set (no-color.org).
     """
     if stream is None or not stream.isatty() or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
         return text
@@ -51,7 +51,7 @@ def print_answer(arguments: argparse.Namespace, code: int, text: str, document: 
 
 
 def print_error(kind: str, message: str, code: int, more: Mapping[str, object] | None = None) -> None:
-    """Print the one JSON object of a command that failed; `kind` is the name of an error of `errors.py`.
+    """Print the one JSON object of a command that failed on stdout; `kind` is the name of an error of `errors.py`.
 
     Where it cannot be written, on a full disk for example, the exit code is left to say it.
     """
@@ -75,7 +75,7 @@ def person_types() -> bool:
 
 
 def tell(arguments: argparse.Namespace, line: str) -> None:
-    """Print a progress line while a verb works; a line that cannot be written ends nothing, least of all a motion."""
+    """Print a progress line above the bar or on stdout (`--json`: stderr); ignore that it cannot be written."""
     bar = getattr(arguments, "progress", None)
     if bar is not None and sys.stdout is not None and sys.stdout.isatty() and bar.tell(line):
         return
@@ -157,7 +157,7 @@ def writable_state_folder(arguments: argparse.Namespace) -> Path:
 
 
 def enable_interrupts() -> None:
-    """Make Ctrl-C interrupt this process although the shell that started it had SIGINT ignored.
+    """Make Ctrl-C interrupt this process although its shell had SIGINT ignored, unless hangups are ignored too.
 
     A shell without job control, that of a script for example, starts `command &` with SIGINT ignored (POSIX.1-2017,
     Shell Command Language, 2.11), and what is started inherits it. Where hangups are ignored too, `nohup` was asked for
@@ -178,7 +178,7 @@ def _heard() -> list[signal.Signals]:
 
 @contextmanager
 def interrupting() -> Iterator[None]:
-    """Raise KeyboardInterrupt on SIGTERM and SIGHUP too, so that whoever drives an arm releases it first."""
+    """Raise KeyboardInterrupt on SIGTERM and SIGHUP too during the block, so that an arm is released first."""
     before = {number: signal.signal(number, signal.default_int_handler) for number in _heard()}
     try:
         yield
@@ -198,7 +198,7 @@ class StopOnSignal:
         self._asked = False
 
     def requested(self) -> bool:
-        """Return whether a stop has been requested."""
+        """Return whether a signal has requested a stop since the block was entered."""
         return self._asked
 
     def __enter__(self) -> None:

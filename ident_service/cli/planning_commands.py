@@ -651,6 +651,6 @@ def _lines() -> Callable[[], str | None]:
 
 
 def add(verbs: VerbList) -> None:
-    """Register the verbs of this module."""
+    """Register the verbs about motions, descriptions, the bus, `doctor` and the emulator."""
     for register in (_add_motions, _add_configs, _add_bus, _add_doctor, _add_emulate):
         register(verbs)

@@ -51,7 +51,7 @@ class Mark:
 
 
 def estimate(begun: float, first: Mark, mark: Mark, now: float) -> tuple[float | None, float | None]:
-    """Return the share that is done, and the time that is left [s]; None for what cannot be known.
+    """Return (share that is done, time left [s]), extrapolated from the marks; None for what cannot be known.
 
     Args:
         begun: time when the command began [s].
@@ -71,7 +71,7 @@ def estimate(begun: float, first: Mark, mark: Mark, now: float) -> tuple[float |
 
 
 def time_left(seconds: float | None, elapsed: float) -> str:
-    """Format the time that is left [s] for a person, or the time that is over [s] where that is not known."""
+    """Format the time left [s] as `about 5 s left`; where it is None, the elapsed time [s] as `5 s`."""
     if seconds is None:
         return f"{elapsed:.0f} s"
     if seconds < 90.0:
@@ -105,7 +105,7 @@ class ProgressBar:
             self._thread.join(_LEAVE)
 
     def step(self, words: str, share: float | None = None, left: float | None = None) -> None:
-        """Tell what is being done; never waits.
+        """Set the words, share and time left that the bar shows next; never waits.
 
         Args:
             words: description of the step for a person.
@@ -117,7 +117,7 @@ class ProgressBar:
             self._first = mark
 
     def tell(self, line: str) -> bool:
-        """Print a line above the bar without waiting; return whether there is a bar."""
+        """Queue a line to print above the bar, without waiting; return False, line dropped, if no bar is shown."""
         if self._bar is None or self._over.is_set():
             return False
         self._lines.append(line)
@@ -125,7 +125,7 @@ class ProgressBar:
 
     @contextmanager
     def hidden(self) -> Iterator[None]:
-        """Hide the bar during the block, in which a person is asked."""
+        """Hide the bar during the block, in which a person is asked, and do not count its time as work."""
         with self._drawing:
             self._hidden = True
             if self._bar is not None:
@@ -188,7 +188,7 @@ def _rich_bar() -> Progress:
 
 
 def progress_bar(arguments: argparse.Namespace) -> ProgressBar:
-    """Return the bar of a verb, which draws on a terminal only, and keep it for `step_of`."""
+    """Create the bar of a verb, which draws on a terminal only, and keep it as `arguments.progress` for `step_of`."""
     terminal = sys.stderr is not None and sys.stderr.isatty() and not arguments.json
     silent = arguments.word in _WITHOUT | _AT_ONCE or getattr(arguments, "hold_to_run", False)
     bar = arguments.progress = ProgressBar(f"ident {arguments.word}", wanted=terminal and not silent)
@@ -196,13 +196,13 @@ def progress_bar(arguments: argparse.Namespace) -> ProgressBar:
 
 
 def step_of(arguments: argparse.Namespace) -> Callable[..., None]:
-    """Return `ProgressBar.step` of a verb; a function that does nothing where the verb was not typed."""
+    """Return the function that sets what the verb's bar shows; one that does nothing where it has no bar."""
     bar: ProgressBar | None = getattr(arguments, "progress", None)
     return (lambda *_, **__: None) if bar is None else bar.step
 
 
 def ask(arguments: argparse.Namespace, question: str) -> str:
-    """Ask a person at the terminal, without a bar in the way."""
+    """Print a question at the terminal, the bar hidden meanwhile, and return the line that the person types."""
     bar: Any = getattr(arguments, "progress", None)
     if bar is None:
         return input(question)

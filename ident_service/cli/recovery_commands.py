@@ -316,6 +316,6 @@ def _step(arguments: argparse.Namespace, *words: str) -> Answer:
 
 
 def add(verbs: VerbList) -> None:
-    """Register the verbs of this module."""
+    """Register `home`, `set-home`, `recover` and `reidentify`."""
     for register in (_add_recovery, _add_reidentify):
         register(verbs)

@@ -77,7 +77,7 @@ def add(verbs: VerbList) -> None:
 
 
 def run_on_daemon(arguments: argparse.Namespace) -> Answer:
-    """Run a verb on the daemon that `--server` names.
+    """Run a verb on the daemon that `--server` names and return its answer; raise UsageError where no daemon can do it.
 
     Raises:
         UsageError: a verb that no daemon does.
@@ -97,21 +97,21 @@ def run_on_daemon(arguments: argparse.Namespace) -> Answer:
 
 
 def table() -> dict[str, RemoteVerb]:
-    """Return the verbs that a daemon can do."""
+    """Map each verb that a daemon can do to (its function, the names of the arguments that it sends)."""
     from ident_service.cli import remote_results, remote_watching
 
     return REMOTE | remote_results.VERBS | remote_watching.VERBS
 
 
 def carrying(words: str, verb: Verb) -> RemoteVerb:
-    """Return a verb with the names of the arguments that it sends to a daemon."""
+    """Pair the function of a remote verb with the set of arguments, named in `words` with spaces, that it sends."""
     return verb, frozenset(words.split())
 
 
 def job(
     words: str, kind: str | None = None, *, more: str = "", ended: Ended | None = None, **fields: Reader
 ) -> RemoteVerb:
-    """Return a verb that is a job with the arguments' values.
+    """Return a remote verb that runs a job, with the arguments named in `words` and those of `fields` as its fields.
 
     Args:
         words: arguments that are fields of the job under their own names.
@@ -154,7 +154,7 @@ def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
 
 @contextmanager
 def telling_of_arm(arm: str, job: str) -> Iterator[None]:
-    """Add to the error of a daemon that is gone what becomes of the arm that it moved."""
+    """Re-raise an ArmError of the block, a daemon that is gone, with what the arm does that it moved."""
     from ident_service.client import left_alone
 
     try:
@@ -166,7 +166,7 @@ def telling_of_arm(arm: str, job: str) -> Iterator[None]:
 
 
 def job_verb(make: Callable[[IdentClient, argparse.Namespace], dict[str, Any]], ended: Ended | None = None) -> Verb:
-    """Return a verb that runs as a job of the daemon.
+    """Return a function that queues a job on the daemon, waits for its end, and returns the verb's answer.
 
     Args:
         make: the job of the words; its kind is the verb if it does not say another.
@@ -216,12 +216,12 @@ def _after(client: IdentClient, arguments: argparse.Namespace) -> list[dict[str,
 
 
 def motion_of(client: IdentClient, arguments: argparse.Namespace) -> str | None:
-    """Return the id of a verb's motion, as `motion_id`."""
+    """Return the id of the motion that the arguments name, uploading it if it is a file; None for the description's."""
     return motion_id(client, arguments.arm, arguments.motion)
 
 
 def run_job(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the request of a run without a key; upload its motion first if it is a file."""
+    """Return the fields of a `run` job: arm, motion id, speed, accuracy target; upload a motion file first."""
     return {
         "arm": arguments.arm,
         "motion": motion_of(client, arguments),
@@ -351,7 +351,7 @@ def follow(
     ours: bool = True,
     every: float = _LOOK,
 ) -> dict[str, Any]:
-    """Tell the phases of a job until it has ended, and renew its lease.
+    """Poll a job until it has ended, print its phases and renew its lease; return the job as it was last.
 
     Args:
         client: of the daemon.
@@ -416,7 +416,7 @@ def renew(client: IdentClient, job: str) -> bool:
 
 
 def job_answer(client: IdentClient, job: dict[str, Any], code: int | None = None) -> Answer:
-    """Return what the command of a job printed, with the exit code of the job's state unless one is given.
+    """Fetch a job's result; return (exit code, by the job's state unless one is given, text, document).
 
     The text begins with how the job ended where that is not in what the command printed. Commands that it names are for
     the daemon, too.
@@ -452,7 +452,7 @@ def _with_state(answer: Answer) -> Answer:
 
 
 def typed_name(arguments: argparse.Namespace) -> str:
-    """Return the arm's name as a person types it, now or as `--confirm`.
+    """Return the arm's name as a person types it now, or gave as `--confirm`; raise UsageError for any other word.
 
     Raises:
         UsageError: another word, or nobody to ask.
@@ -466,14 +466,14 @@ def typed_name(arguments: argparse.Namespace) -> str:
 
 
 def confirmation(client: IdentClient, arguments: argparse.Namespace, name: str | None = None) -> dict[str, str]:
-    """Return the confirmation of a motion: the arm's name as a person typed it, and a fresh challenge."""
+    """Return a motion's confirmation: the arm's name as a person typed it, and a challenge from the daemon."""
     name = typed_name(arguments) if name is None else name
     word = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/challenge")["challenge"]
     return {"name": name, "challenge": word}
 
 
 def motion_id(client: IdentClient, arm: str, motion: Path | None) -> str | None:
-    """Return the id of a motion; upload it first if it is a file."""
+    """Return the id of a motion, uploading it first if it is a file; raise UnknownId if the daemon does not have it."""
     if motion is None:
         return None
     if motion.is_file():
@@ -484,7 +484,7 @@ def motion_id(client: IdentClient, arm: str, motion: Path | None) -> str | None:
 
 
 def connection(arguments: argparse.Namespace) -> IdentClient:
-    """Connect to the daemon that `--server` names, or to that which serves the state folder.
+    """Make the client of the daemon that `--server` names, or of that which serves the state folder; sends nothing yet.
 
     Raises:
         UsageError: there is none, or no token for it.

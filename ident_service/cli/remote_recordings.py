@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 def recording(
     client: IdentClient, arguments: argparse.Namespace, arm: str, path: Path, columns: Path | None = None
 ) -> dict[str, Any]:
-    """Return a recording as jobs name it; upload it first if it is a local file.
+    """Return the fields by which a job names a recording; upload it first if it is a local file, else check its run.
 
     Args:
         client: of the daemon.
@@ -43,7 +43,7 @@ def recording(
 
 
 def require_registered(client: IdentClient, kind: str, named: str, path: Path) -> None:
-    """Refuse what is neither a file here nor something that the daemon knows.
+    """Raise UnknownId unless the daemon knows a run or motion of the id `named`; local files are not looked at.
 
     Args:
         client: of the daemon.
@@ -65,7 +65,7 @@ def require_registered(client: IdentClient, kind: str, named: str, path: Path) -
 
 
 def word_of_address(word: str) -> str:
-    """Return a word that may stand in an address."""
+    """Return the word unchanged if it may stand in a URL's path; raise UsageError for others."""
     if not word or any(letter in word for letter in "/?#% \\") or not word.isprintable() or word.startswith("."):
         raise UsageError(f"{word!r}: with --server, arms, runs and jobs are named by id, not by path")
     return word

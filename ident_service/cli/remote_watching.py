@@ -50,7 +50,7 @@ def _known(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def named_files(path: Path) -> dict[str, str]:
-    """Read the files beside a description that it names by plain names, and those that they name if they are YAML.
+    """Read the text files beside a description that it names, and those that its YAML files name; map name to content.
 
     Args:
         path: of the description.

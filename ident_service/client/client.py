@@ -66,7 +66,7 @@ class Job:
 
     @property
     def unentered(self) -> bool:
-        """Tell if the job has ended and the daemon cannot enter that yet, on a full disk for example; `detail` says."""
+        """Tell if the job has ended but the daemon cannot write that to its registry, on a full disk for example."""
         return self.state == "running" and bool(self.detail)
 
 
@@ -164,7 +164,7 @@ class IdentClient(Connection):
     """HTTP client of a daemon; may be used from any thread."""
 
     def arms(self) -> list[dict[str, Any]]:
-        """List the arms (`ArmLine`)."""
+        """Return all arms that the daemon knows, each as the JSON object `ArmLine`."""
         return list(self.pages(f"{_API}/arms"))
 
     def arm(self, name: str) -> RemoteArm:
@@ -179,7 +179,7 @@ class IdentClient(Connection):
         replace: bool = False,
         meshes: Mapping[str, bytes] | None = None,
     ) -> RemoteArm:
-        """Add an arm.
+        """Upload an arm's description and files to the daemon; return a handle on the arm.
 
         Args:
             description: the YAML.
@@ -198,16 +198,16 @@ class IdentClient(Connection):
         return self.arm(str(self.post(f"{_API}/arms", body)["name"]))
 
     def stop(self) -> dict[str, list[str]]:
-        """Bring all arms to a controlled stop; return the names of the arms and jobs that were reached."""
+        """Ask for a controlled stop of all arms, without waiting; return `arms` (names) and `jobs` (ids) reached."""
         found: dict[str, list[str]] = self.post(f"{_API}/stop")
         return found
 
     def job(self, job: str) -> Job:
-        """Return the present state of a job."""
+        """Ask the daemon for the present state of a job, and return it."""
         return _job(self.get(f"{_API}/jobs/{_word(job)}"))
 
     def events(self, *, after: int | None = None, samples: bool = False) -> Iterator[Event]:
-        """Yield the events of all arms and jobs until the caller stops iterating.
+        """Yield the events of all arms and jobs, reconnecting where the stream breaks, until the caller stops.
 
         After a broken connection the stream is resumed where it broke off, so that no event is missed or repeated.
 
@@ -236,17 +236,17 @@ class IdentClient(Connection):
             time.sleep(_AGAIN)
 
     def jobs(self, *, arm: str | None = None) -> Iterator[Job]:
-        """List jobs, or those of an arm, the newest first."""
+        """Yield jobs, or those of an arm, the newest first, fetched page by page."""
         return map(_job, self.pages(_listed("jobs", arm)))
 
     def runs(self, *, arm: str | None = None) -> Iterator[dict[str, Any]]:
-        """List runs, or those of an arm, the newest first (`RunLine`)."""
+        """Yield runs, or those of an arm, as JSON objects (`RunLine`), the newest first, fetched page by page."""
         return self.pages(_listed("runs", arm))
 
     def upload(
         self, arm: str, file: Path, *, columns: str = "", tell: Callable[[float], None] = lambda _: None
     ) -> dict[str, str]:
-        """Upload a recording in pieces; pieces that arrived in an earlier attempt are not sent again.
+        """Upload a recording, only the pieces that have not arrived before; return its `run` id and `name` for jobs.
 
         Args:
             arm: name of the arm that it is of.
@@ -280,7 +280,7 @@ class IdentClient(Connection):
         return {"run": str(seen["run"]), "name": str(seen["name"])}
 
     def begin(self, kind: str, *, key: str | None = None, **asked: Any) -> Job:
-        """Queue a computation and return at once.
+        """Queue a computation and return its job at once, without waiting for it.
 
         Args:
             kind: `simulate`, `design`, `identify`, `export` and so on.
@@ -291,7 +291,7 @@ class IdentClient(Connection):
         return _job(self.post(f"{_API}/jobs", body, {} if key is None else {"Idempotency-Key": key}))
 
     def compute(self, kind: str, *, key: str | None = None, **asked: Any) -> Job:
-        """Queue a computation and wait for its end; as `begin`.
+        """Queue a computation, wait for its end and return the job, `done` or `refused`; any other end raises.
 
         Returns:
             The job: `done`, or `refused` where the verdict is no (not feasible, must not be used).
@@ -305,10 +305,7 @@ class IdentClient(Connection):
         return ended
 
     def failure(self, ended: Job) -> IdentError:
-        """Return the error that says how a job ended which is not `done`, as the command that did it raised it.
-
-        Of one whose arm is held, it says why the arm was stopped.
-        """
+        """Return, without raising it, the error that says why a job is not `done`, or its arm stopped and held."""
         if ended.held:
             return self._held(ended)
         said = self.answer(ended.id).get("error") or {}
@@ -328,7 +325,7 @@ class IdentClient(Connection):
         return ArmFault(faults[0]["code"], f"{faults[0]['cause']}; {words}")
 
     def wait(self, job: str) -> Job:
-        """Wait until a job has ended, or its arm is held until a person confirms that it is supported (`held`).
+        """Poll a job until it has ended or its arm is `held` for a person's word; return it as it is then.
 
         An end that the daemon cannot enter (`unentered`) is waited for 10 s.
         """
@@ -342,7 +339,7 @@ class IdentClient(Connection):
         return seen
 
     def answer(self, job: str) -> dict[str, Any]:
-        """Return the JSON object that the command of a job answered."""
+        """Return the JSON object that the command of a job has printed as its answer."""
         found: dict[str, Any] = self.get(f"{_API}/jobs/{_word(job)}/result")["answer"]
         return found
 
@@ -361,12 +358,12 @@ class RemoteArm:
         return found
 
     def stop(self) -> dict[str, list[str]]:
-        """Bring the arm to a controlled stop."""
+        """Ask for a controlled stop of the arm, without waiting; return the `arms` (names) and `jobs` (ids) reached."""
         found: dict[str, list[str]] = self.client.post(f"{self._path}/stop")
         return found
 
     def faults(self) -> list[dict[str, Any]]:
-        """List the faults that nobody has acknowledged (`FaultAnswer`)."""
+        """List the faults of the arm that nobody has acknowledged (`FaultAnswer`)."""
         found: list[dict[str, Any]] = self.client.get(f"{self._path}/faults")
         return found
 
@@ -382,17 +379,17 @@ class RemoteArm:
         self.client.post(f"{self._path}/supported", {"confirm": confirm})
 
     def acknowledge(self, code: str) -> None:
-        """Acknowledge a fault by its name."""
+        """Acknowledge the arm's fault with this code."""
         self.client.post(f"{self._path}/faults/{_word(code)}/ack")
 
     def check(self, motion: str | None = None, *, confirm: str) -> RemoteMotion:
-        """Begin the preflight of a motion; arguments and errors as `run`."""
+        """Queue the preflight of a motion, the description's if None; return a handle with the lease, as `run`."""
         return self._begin("check", confirm, motion=motion)
 
     def run(
         self, motion: str | None = None, *, confirm: str, speed: float | None = None, until: float | None = None
     ) -> RemoteMotion:
-        """Begin a run; use it in a `with` block, which renews its lease.
+        """Queue a run of a motion; return its handle, whose `with` block renews the lease and waits for the end.
 
         Args:
             motion: id; the description's own if None.
@@ -407,15 +404,15 @@ class RemoteArm:
         return self._begin("run", confirm, motion=motion, speed=speed, until=share)
 
     def home(self, *, confirm: str) -> RemoteMotion:
-        """Begin the motion to the home position; arguments and errors as `run`."""
+        """Queue the motion to the home position; return its handle, whose `with` block renews the lease."""
         return self._begin("home", confirm)
 
     def finish(self) -> None:
-        """End a run early by its regular end: the rest of the motion is left out."""
+        """End the arm's run early and in order: the rest of the motion is left out, the arm goes to its start."""
         self.client.post(f"{self._path}/finish")
 
     def accept(self, run: str, note: str) -> dict[str, Any]:
-        """Accept the parameters of a run on a person's decision (`AcceptanceAnswer`)."""
+        """Make the parameters of a run the arm's accepted ones, as a person decided; return the `AcceptanceAnswer`."""
         found: dict[str, Any] = self.client.post(f"{self._path}/acceptances", {"run": run, "note": note})
         return found
 
@@ -427,7 +424,7 @@ class RemoteArm:
 
 
 def left_alone(gone: ArmError, arm: str, job: str) -> ArmError:
-    """Return the error of a daemon that is gone, with what the arm does that it moved, and what shows it.
+    """Return an ArmError: the words of `gone`, how the arm stops by itself, and which commands show it.
 
     Args:
         gone: error that tells why the daemon cannot be reached.
@@ -465,7 +462,7 @@ class RemoteMotion:
 
     @property
     def ended(self) -> Job:
-        """Return the job after its end.
+        """Return the job as it ended; raise UsageError before the `with` block has been left.
 
         Raises:
             UsageError: the block has not been left.
@@ -475,7 +472,7 @@ class RemoteMotion:
         return self._ended
 
     def live(self) -> Iterator[LiveSample]:
-        """Yield samples of a run until it ends or its arm is held; `uncertainty` has the deviations so far."""
+        """Yield samples of a run until it ends or its arm is held; set `uncertainty` to the newest deviations."""
         for kind, _, value in self.client.stream(f"{_API}/jobs/{self.id}/live"):
             if kind == "job" and (value["job"].get("held") or _job(value["job"]).unentered):
                 return
@@ -487,7 +484,7 @@ class RemoteMotion:
                     yield LiveSample(at, joints, *rows)
 
     def cancel(self) -> None:
-        """Bring the arm to a controlled stop; the job then says what happened, and the block raises nothing for it."""
+        """Ask for a controlled stop of the motion, without waiting; the `with` block then raises nothing for it."""
         self._cancelled = True
         self.client.post(f"{_API}/jobs/{self.id}/cancel")
 

@@ -72,15 +72,15 @@ class Connection:
             raise errors.UsageError(f"{url}: cannot be asked: {error}") from None
 
     def get(self, path: str) -> Any:
-        """Send GET for a path and return the answer; raises as `ask`."""
+        """Send GET for a path and return the answer's JSON values; raise IdentError if it fails."""
         return self.ask("GET", path)
 
     def post(self, path: str, body: Any = None, headers: Mapping[str, str] = NOTHING) -> Any:
-        """Send POST to a path and return the answer; raises as `ask`."""
+        """Send POST to a path, an empty object if there is no body; return the answer's JSON values, or raise."""
         return self.ask("POST", path, {} if body is None else body, headers)
 
     def delete(self, path: str) -> Any:
-        """Send DELETE for a path and return the answer; raises as `ask`."""
+        """Send DELETE for a path and return the answer's JSON values; raise IdentError if it fails."""
         return self.ask("DELETE", path)
 
     def ask(
@@ -92,7 +92,7 @@ class Connection:
         *,
         patience: float | None = None,
     ) -> Any:
-        """Send one request and return its answer as JSON values.
+        """Send one request, wait for its answer and return that as JSON values; raise the error that the daemon names.
 
         Args:
             method: HTTP method.
@@ -107,14 +107,14 @@ class Connection:
         return self._document(*self._exchange(method, path, body, headers, patience)[:2])
 
     def pages(self, path: str) -> Iterator[Any]:
-        """Yield the entries of a paged list, page by page to its end; raises as `ask`."""
+        """Yield the entries of a paged list, requesting page by page to its end; raise IdentError if that fails."""
         after: str | None = path
         while after is not None:
             status, content, after = self._exchange("GET", after, None, {})
             yield from self._document(status, content)
 
     def content(self, path: str) -> bytes:
-        """Download a file and return its bytes.
+        """Download a file and return its bytes; raise IdentError if it is refused, or of `_MOST` bytes or more.
 
         Raises:
             IdentError: as `ask`; or it is larger than what is taken.
@@ -223,7 +223,7 @@ def _plain(token: str, url: str) -> str:
 
 
 def error_of(kind: str, message: str, dependents: Sequence[Mapping[str, Any]] = ()) -> errors.IdentError:
-    """Return the error that a daemon, or the command of a job, tells of; `IdentError` itself for one without a name.
+    """Make, without raising it, the error of the class named `kind`; `IdentError` itself where there is no such class.
 
     Args:
         kind: name of the error.

@@ -92,7 +92,7 @@ class Authenticator:
         self._tokens, self._sessions = digests(self._db), sessions(self._db)
 
     def known(self, secret: str | None, session: str | None) -> Access | None:
-        """Return whose token or session this is from the copy in memory, without throttle and without waiting.
+        """Return name and role of a token, or else a session, by the copy in memory; None if it is not valid.
 
         A token that was revoked at a terminal counts here until the next `refresh`, which each request brings about.
         """
@@ -103,7 +103,7 @@ class Authenticator:
         return None if key is None else self._tokens.get(key)
 
     def by_token(self, secret: str, address: str) -> Access | None:
-        """Return whose token this is; None if nobody's.
+        """Look a token up in the registry; return its name and role, or None, counted as a failed attempt, if unknown.
 
         Raises:
             Throttled: too many failed attempts; a token that was good from this address before is still heard.
@@ -123,7 +123,7 @@ class Authenticator:
         return found
 
     def log_in(self, secret: str, address: str) -> tuple[str, Access] | None:
-        """Exchange a token for a session; return None for an unknown token. Raises as `by_token`."""
+        """Begin a session for a token; return (the session's secret, its name and role), None for an unknown token."""
         found = self.by_token(secret, address)
         if found is None:
             return None
@@ -133,7 +133,7 @@ class Authenticator:
         return session, found
 
     def by_session(self, session: str) -> Access | None:
-        """Return whose session this is; None if nobody's, or if it has expired."""
+        """Read the registry anew and return name and role behind a session; None if it is unknown or has expired."""
         self.refresh()
         return self.known(None, session)
 
@@ -143,7 +143,7 @@ class Authenticator:
         self.refresh()
 
     def challenge(self, arm: str, who: str) -> str:
-        """Return a challenge that confirms one motion of an arm, once, together with the arm's typed name."""
+        """Make a random word by which this caller confirms one motion of an arm, once, within a short time."""
         word = secrets.token_urlsafe(16)
         with self._lock:
             entry = _Challenge(arm, who, self._now() + CHALLENGE_SECONDS)

@@ -62,7 +62,7 @@ def raise_connection_limit() -> int:
 
 
 def receive_little_of_tls() -> None:
-    """Let asyncio decrypt and hold little of a connection at a time; 256 kB of one-byte records take 20 ms."""
+    """Make asyncio decrypt at most `_AT_A_TIME` bytes of any TLS connection at once; more blocks the loop."""
     sslproto.SSLProtocol.max_size = _AT_A_TIME
 
 
@@ -85,11 +85,11 @@ class Connections:
 
     @property
     def full(self) -> bool:
-        """Return whether even the connections that are being closed have not been closed yet."""
+        """Return whether open and closing connections are together as many as may be, so that none is accepted."""
         return len(self._open) + self._leaving >= self._most + _LEAVING
 
     def busy(self, peer: Peer | None) -> bool:
-        """Return whether as many requests are being answered as may be, of all addresses or of this peer's."""
+        """Return whether 3/4 of the connections allowed in all, or to this peer's address, are being answered."""
         if len(self._open) - len(self._waiting) >= 3 * self._most // 4:
             return True
         most, host = 3 * self._most_of_one // 4, None if peer is None else peer[0]
@@ -130,7 +130,7 @@ class Connections:
                 self._waiting[peer] = self._now() + BODY_SECONDS
 
     def request_received(self, peer: Peer | None) -> None:
-        """Note that a request is complete."""
+        """Note that a request has been received whole: its connection has no deadline until the answer."""
         if peer is not None:
             self._waiting.pop(peer, None)
 
@@ -159,7 +159,7 @@ class Connections:
                 self._waiting[peer] = self._now() + HEADER_SECONDS
 
     def closed(self, connection: Connection) -> None:
-        """Remove a connection that is closed."""
+        """Remove a connection that is closed from the table."""
         if self._open.get(connection.peer) is connection:
             self._forget(connection.peer)
         elif connection.leaving:
@@ -200,13 +200,13 @@ class Connection(socket.socket):
 
     @classmethod
     def of(cls, accepted: socket.socket, peer: Peer, book: Connections) -> Self:
-        """Make a connection of an accepted socket."""
+        """Make a connection of an accepted socket, whose file descriptor it takes over."""
         made = cls(accepted.family, accepted.type, accepted.proto, fileno=accepted.detach())
         made.peer, made.book = peer, book
         return made
 
     def close(self) -> None:
-        """Close the socket, and tell the table once."""
+        """Close the socket and, the first time, remove it from the table of connections."""
         gone = self.fileno() < 0
         super().close()
         if not gone:
@@ -227,7 +227,7 @@ class Listener(socket.socket):
         self._book, self._accepted, self._gone = book, 0, 0
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """Accept the next connection that is admitted.
+        """Return (socket, address) of the next connection that is admitted; the others are closed.
 
         Raises:
             BlockingIOError: nobody waits, or it is somebody else's turn in the event loop.
@@ -280,7 +280,7 @@ class ReadingTurns:
         return self._spent < _TURN and self._requests < _REQUESTS and self._pieces < _PIECES
 
     def read(self, reader: FairReader) -> None:
-        """Read one piece of a request now."""
+        """Let a connection read and handle one piece of its input now, and count the time against this turn."""
         began = time.thread_time()
         try:
             self._requests += reader.read_piece()
@@ -290,7 +290,7 @@ class ReadingTurns:
             self._schedule()
 
     def wait(self, reader: FairReader) -> None:
-        """Let a connection wait for its turn."""
+        """Queue a connection, behind others of its host, to read its next piece when its turn comes."""
         self._waiting.setdefault(reader.host, deque()).append(reader)
         self._schedule()
 
@@ -332,7 +332,7 @@ class FairReader(H11Protocol):
         self._more_requests = self._queued = self._reading = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin to read."""
+        """Prepare a new connection: note the client's address, limit its TLS buffer, set up flow control."""
         super().connection_made(transport)
         self.host = self.client[0] if self.client else ""
         if hasattr(transport, "max_size"):  # with TLS as `receive_little_of_tls` says
@@ -340,7 +340,7 @@ class FairReader(H11Protocol):
         self.flow = _ReaderFlow(transport, self)
 
     def data_received(self, data: bytes) -> None:
-        """Read what has come, or the first piece of it, if it is this connection's turn."""
+        """Store what has come, and handle its first piece at once if nobody else waits; else queue for a turn."""
         urgent = not self._waits and self._urgent(data)
         self._received += data
         if not self._queued:
@@ -365,12 +365,12 @@ class FairReader(H11Protocol):
         self._drop_answer()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Forget what has not been read."""
+        """Drop what has been received of a lost connection and not been handled."""
         self._forget()
         super().connection_lost(exc)
 
     def read_piece(self) -> bool:
-        """Read the next piece.
+        """Handle the next piece of the received input; return whether a request has begun or become whole by it.
 
         Returns:
             Whether a request has begun, or has become whole, so that the application goes to work.
@@ -404,7 +404,7 @@ class FairReader(H11Protocol):
         return before != (self.cycle, self.conn.their_state)
 
     def go_on(self) -> None:
-        """Wait for the next turn if something waits to be read, else receive more."""
+        """Queue for the next turn if received input is left, else let the transport receive more."""
         if self._waits:
             self._wait(self._turns)
         elif not self.flow.read_paused and not self.transport.is_closing():

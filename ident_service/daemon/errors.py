@@ -76,7 +76,7 @@ def api_router(tag: str, *statuses: int) -> APIRouter:
 
 
 def status_of(error: errors.IdentError) -> int:
-    """Return the HTTP status for an error."""
+    """Return the HTTP status for an error by its class; 500 for a class that has none."""
     return next((status for kind, status in _STATUS if isinstance(error, kind)), 500)
 
 

@@ -74,7 +74,7 @@ class Thinned:
     measured: Array | None
 
     def document(self) -> dict[str, Any]:
-        """Return JSON values: each quantity as a list per joint; None for what is not finite."""
+        """Return JSON values: joints, time [s], and each quantity as a list per joint; None for what is not finite."""
         shown = {"position": 5, "reference": 5, "torque": 4, "error": 7, "measured": 4}
         given = {name: values for name in shown if (values := getattr(self, name)) is not None}
         return {
@@ -85,7 +85,7 @@ class Thinned:
 
 
 def thinned(samples: Samples, names: tuple[str, ...], first_ns: int) -> Thinned:
-    """Return one point of every bin of `BIN_NS` of samples.
+    """Return the last sample of every bin of `BIN_NS`, with the error of greatest magnitude in the bin.
 
     Args:
         samples: consecutive cycles.
@@ -131,7 +131,7 @@ class LiveRun:
         self.broken = ""
 
     def since(self, number: int) -> list[Frame]:
-        """Return the frames after this number; read on in the file if no viewer has just done so."""
+        """Return the frames numbered above `number`, after reading on in the recording if nobody has just done so."""
         now = self._now()
         self._seen = now
         if self._lock.acquire(blocking=False):
@@ -147,7 +147,7 @@ class LiveRun:
         return [frame for frame in list(self._frames) if frame.number > number]
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the recording's file; `since` then reads nothing more."""
         with self._lock:
             self._seen = -math.inf
             if self._tail is not None:
@@ -218,7 +218,7 @@ class LiveRuns:
         self._lock, self._runs = threading.Lock(), OrderedDict[str, LiveRun]()
 
     def run(self, name: str, folder: Path) -> LiveRun:
-        """Return the run of this id, added if it is new."""
+        """Return the live view of the run of this id, made if new; the longest unused ones are closed if too many."""
         with self._lock:
             found = self._runs.setdefault(name, LiveRun(folder))
             self._runs.move_to_end(name)

@@ -38,7 +38,7 @@ def _shown(service: Service, row: Row) -> str:
 
 
 async def live_events(service: Service, live: LiveRuns, row: Row) -> AsyncIterator[str]:
-    """Yield events until the job ends: `job`, and `samples` and `doubt` of a run that is recorded or an arm at rest."""
+    """Yield server-sent events until the job ends: `job` on changes; `samples` and `doubt` of a recorded run."""
     run = None
     if row["kind"] in RECORDED and row["run"] is not None and row["state"] in rows.LIVE:
         run = live.run(row["id"], service.state / RUNS / str(row["run"]))

@@ -64,7 +64,7 @@ class Metrics:
         registry.register(self._lateness)
 
     def request(self, method: str, status: int, seconds: float, *, stop: bool = False) -> None:
-        """Count one request; `stop` tells whether it was a stop."""
+        """Count one request by method and status, and its duration [s], also among stops if it was one."""
         known = method if method in _METHODS else "other"
         self._requests.labels(known, str(status)).inc()
         self._seconds.inc(seconds)
@@ -73,7 +73,7 @@ class Metrics:
             self._stop.observe(seconds)
 
     def renewed(self, age: float) -> None:
-        """Record the renewal of a lease at an age [s]."""
+        """Record how old [s] a lease was when it was renewed."""
         self._lease.observe(age)
 
     def job(self, kind: str, state: str, waited: float, ran: float | None) -> None:
@@ -90,7 +90,7 @@ class Metrics:
             self._job.labels(kind, state).observe(ran)
 
     def lateness(self, document: Any) -> None:
-        """Add the cycles of a run from its `ended.json`; a document of another form is left out."""
+        """Add the lateness histogram of a run, from its `ended.json`; a document of another form is left out."""
         self._lateness.add(document)
 
     def text(

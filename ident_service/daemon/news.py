@@ -92,7 +92,7 @@ class EventPoller:
         self._ending = set[str]()  # jobs whose end may not have been seen
 
     def begin(self, after: int | None) -> ViewerPosition:
-        """Return the position of a new viewer.
+        """Return where a new viewer begins: behind the audit line `after`, or behind the last one if None.
 
         Args:
             after: number of the last line that was seen; only events from now on are reported if None.
@@ -103,7 +103,7 @@ class EventPoller:
 
     @property
     def due(self) -> bool:
-        """Return whether it is time to poll again."""
+        """Return whether `LOOK` seconds have passed since the last poll."""
         return self._now() - self._looked >= LOOK
 
     def look(self) -> None:
@@ -124,14 +124,14 @@ class EventPoller:
         return self._line is not None and seen.line < self._line and not self._has_buffered_line(seen.line)
 
     def earlier(self, seen: ViewerPosition) -> list[ViewerEvent]:
-        """Return a page of lines from the registry for a viewer who is behind."""
+        """Return the next page of audit lines for a viewer who is behind, and move the viewer's position on."""
         found = [_line(row) for row in audit_entries_after(self._db, seen.line, _PAGE)]
         # No lines: the registry has been restored to an earlier state.
         seen.line = (found[-1].number if found else self._line) or 0
         return found
 
     def since(self, seen: ViewerPosition) -> list[ViewerEvent]:
-        """Return the events in memory that are new to a viewer, without waiting."""
+        """Return the events in memory that are new to a viewer, and move the viewer's position on; never waits."""
         found = [one for one in list(self._lines) if one.number is not None and one.number > seen.line]
         if found and found[-1].number is not None:
             seen.line = found[-1].number

@@ -37,7 +37,7 @@ class RecentDocuments:
         self._lock, self._kept = threading.Lock(), OrderedDict[tuple[str, ...], str]()
 
     def document(self, key: tuple[str, ...], make: Callable[[], dict[str, Any]]) -> str:
-        """Return the JSON of what `make` returns, made only if the key is new."""
+        """Return the JSON text kept for this key, or else of what `make` returns, which is then kept."""
         with self._lock:  # one at a time: reading recordings and distances of bodies are what costs
             if (found := self._kept.get(key)) is None:
                 found = self._kept[key] = json.dumps(make(), allow_nan=False)
@@ -48,7 +48,7 @@ class RecentDocuments:
 
 
 def series(folder: Path, recording: str) -> dict[str, Any]:
-    """Return the series of a run as JSON values.
+    """Return a recording, thinned for display, as JSON values: time [s] and a list per joint, events.
 
     Args:
         folder: of the run.

@@ -48,7 +48,7 @@ from ident_service.registry.state_folder import URL_FILE, require_private, singl
 
 
 def notify_systemd(line: str) -> bool:
-    """Send one line, `READY=1` for example, without ever waiting for the manager to read.
+    """Send systemd a line such as `READY=1` without waiting; return False only if its queue is full.
 
     Returns:
         False where the manager's queue is full and the line was dropped; it may be sent again. True otherwise, also
@@ -109,7 +109,7 @@ class RepeatFilter(logging.Filter):
         self._kinds: dict[tuple[str, str, object], tuple[float, int]] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return whether a line is written; lines of one logger, template and status count as the same."""
+        """Return whether to write a line: False after `_MOST_ALIKE` lines of its logger, template and status."""
         kind = (record.name, str(record.msg)[:80], getattr(record, "status", None))
         with self._lock:
             if len(self._kinds) > _MOST_KINDS:
@@ -154,7 +154,7 @@ class QueuedHandler(logging.Handler):
 
 
 def log_as_json() -> None:
-    """Write all logs of this process as lines of JSON from now on."""
+    """Write all logs of this process to stderr as lines of JSON from now on, too many alike left out."""
     handler = QueuedHandler(sys.stderr)
     handler.setFormatter(JsonLines())
     handler.addFilter(RepeatFilter())

@@ -66,7 +66,7 @@ class Settings:
 
     @property
     def loopback(self) -> bool:
-        """Return whether only this machine can reach the service."""
+        """Return whether the service listens at a loopback address or `localhost`, where only this machine comes."""
         try:
             return ipaddress.ip_address(self.host).is_loopback
         except ValueError:
@@ -75,7 +75,7 @@ class Settings:
 
     @property
     def tls(self) -> bool:
-        """Return whether the service speaks TLS."""
+        """Return whether the service speaks TLS: a certificate is set."""
         return self.tls_cert is not None
 
     @property

@@ -47,7 +47,7 @@ LONGEST_HEADER: Final = 2**20  # bytes
 
 
 def format_of(columns: str, name: str, config: ArmConfig) -> RecordingFormat:
-    """Read the columns file of a recording as an identification will.
+    """Return the format that a columns file, given as text, describes for a recording of this arm; or raise.
 
     Args:
         columns: content of the file.
@@ -74,7 +74,7 @@ def format_of(columns: str, name: str, config: ArmConfig) -> RecordingFormat:
 
 
 def first_line(path: Path, *, packed: bool) -> bytes:
-    """Return the first line as far as it is there, and as a reader takes it."""
+    """Return the first line of a CSV as far as it has arrived, unpacked if it is `packed` by gzip."""
     with path.open("rb") as stream:
         if not packed:
             return stream.readline(LONGEST_HEADER)
@@ -126,7 +126,7 @@ class Announced:
 
     @property
     def id(self) -> str:
-        """Return the id of this upload."""
+        """Return the id of this upload, a hash of all that was announced: the same announcement resumes it."""
         return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:32]
 
 
@@ -148,7 +148,7 @@ class Upload:
 
 
 def begin_upload(db: Database, state: Path, announced: Announced) -> Upload:
-    """Begin or resume an upload; return how much of the recording has arrived.
+    """Begin or resume an upload; return it with the bytes that have arrived, or the run if it is complete.
 
     Args:
         db: the registry.
@@ -187,7 +187,7 @@ def begin_upload(db: Database, state: Path, announced: Announced) -> Upload:
 
 
 def require_header(db: Database, state: Path, upload: str) -> None:
-    """Refuse a CSV whose header has not the columns that were announced, once its first line has arrived.
+    """Delete an upload and raise if its CSV header lacks announced columns; do nothing until that has arrived.
 
     Args:
         db: the registry.
@@ -216,7 +216,7 @@ def require_header(db: Database, state: Path, upload: str) -> None:
 
 
 def require_readable(path: Path, announced: Announced, config: ArmConfig) -> None:
-    """Refuse a file of which no job could read anything.
+    """Raise RecordingError unless a file's header is that of an MCAP or CSV recording of the arm's joints.
 
     Its header is looked at; what is wrong behind that is told by the job that reads it.
 
@@ -298,7 +298,7 @@ class Piece:
             raise
 
     def write(self, data: bytes) -> None:
-        """Append bytes to the upload.
+        """Append bytes to the upload's file; raise UsageError if that is then larger than announced.
 
         Raises:
             UsageError: they are more than were announced; `withdraw` is to follow.
@@ -312,7 +312,7 @@ class Piece:
             view, self._size = view[written:], self._size + written
 
     def withdraw(self) -> None:
-        """Take back what was written of this piece: it is refused, and so none of it is kept."""
+        """Truncate the upload's file to its size before this piece, which is refused."""
         os.ftruncate(self._fd, self._begin)
         self._size = self._begin
 
@@ -328,7 +328,7 @@ class Piece:
 
 
 def complete_upload(db: Database, state: Path, upload: str, who: str) -> Upload:
-    """Check the hash of a recording that has arrived, and make a run of it.
+    """Make a run of a recording that has arrived whole, if its hash is right; return the upload with the run's id.
 
     Args:
         db: the registry.
@@ -407,11 +407,7 @@ def delete_upload(state: Path, upload: str) -> None:
 
 
 def delete_stale_uploads(state: Path) -> list[str]:
-    """Delete uploads of which nothing has arrived for a day.
-
-    Returns:
-        Their ids.
-    """
+    """Delete uploads of which nothing has arrived for a day; return their ids."""
     now, place, gone = time.time(), state / UPLOADS, []
     for folder in sorted(place.iterdir()) if place.is_dir() else ():
         with suppress(OSError):

@@ -59,7 +59,7 @@ class Acceptance:
 
 
 def accept(db: Database, state: Path, folder: Path, note: str, who: str, *, arm: str | None = None) -> Acceptance:
-    """Make the parameters of a run's folder the arm's current ones.
+    """Verify a run's folder, make its parameters the arm's current accepted set, and close its drift alarms.
 
     Args:
         db: the registry.
@@ -99,7 +99,7 @@ def accept(db: Database, state: Path, folder: Path, note: str, who: str, *, arm:
 
 
 def rollback(db: Database, state: Path, arm: str, note: str, who: str, to: int | None = None) -> Acceptance:
-    """Make an earlier accepted set the current one again.
+    """Make an earlier accepted set the current one again; return the new acceptance that does so.
 
     Args:
         db: the registry.
@@ -155,7 +155,7 @@ def acceptances(state: Path, arm: str) -> list[Acceptance]:
 
 
 def accepted_set(state: Path, arm: str, number: int | None = None) -> tuple[Acceptance, Path]:
-    """Return an acceptance and the folder with its files; the current one if `number` is None.
+    """Return (acceptance, folder with its files, which are verified); the current one if `number` is None.
 
     Raises:
         UsageError: nothing was accepted, or nothing of this number.
@@ -178,7 +178,7 @@ def current_file(state: Path, arm: str) -> Path:
 
 
 def synchronise(db: Database, state: Path) -> None:
-    """Bring `current` and the registry up to date with the accepted sets of every arm; after a kill, for example."""
+    """Bring each arm's folder `current` and the registry up to date with its accepted sets on the disk."""
     place = state / "arms"
     for folder in sorted(place.iterdir()) if place.is_dir() else ():
         if (folder / ACCEPTED).is_dir():
@@ -187,7 +187,7 @@ def synchronise(db: Database, state: Path) -> None:
 
 
 def accepted_runs(db: Database) -> set[str]:
-    """Return the ids of the runs that any acceptance stems from."""
+    """Return the ids of the runs whose parameters were ever accepted, whether they are current or not."""
     return {row["run"] for row in db.rows("SELECT DISTINCT run FROM acceptances")}
 
 

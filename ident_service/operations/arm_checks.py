@@ -92,7 +92,7 @@ def _check_lines(check: Check) -> list[str]:
 
 
 def nearest_measure(check: Check) -> Measure | None:
-    """Return the measure that is nearest to its limit."""
+    """Return the measure with the least room to its limit, relative to that; None if none has value and limit."""
 
     def room(one: Measure) -> float:
         assert one.value is not None  # noqa: S101
@@ -108,7 +108,7 @@ def nearest_measure(check: Check) -> Measure | None:
 
 
 def watch_text(seen: Watched) -> str:
-    """Format the readings of an arm at rest as text."""
+    """Format positions, noise, missing answers and drive states of an arm at rest as text."""
     width = max(5, *(len(name) for name in seen.joint_names))
     lines = [
         f"{seen.cycles} cycles, {seen.lost} frames lost",
@@ -146,7 +146,7 @@ class SampleLines:
 
 
 def watch_document(seen: Watched) -> dict[str, Any]:
-    """Return the readings of an arm at rest as JSON values."""
+    """Return positions, noise, missing answers and drive states of an arm at rest as JSON values."""
 
     def number(value: float) -> float | None:
         return float(value) if isfinite(value) else None
@@ -204,7 +204,7 @@ class ScaleCheck:
 
 
 def check_scale(config: ArmConfig, state: Path, ask: Callable[[str], str], arm: Arm | None = None) -> list[ScaleCheck]:
-    """Ask for a turn of each joint, compare it with the drives' positions, and keep the answers in `scale.json`.
+    """Have a person turn each joint by hand, compare with the drives' positions, and write `scale.json`.
 
     Args:
         config: of the arm; nothing is energised.

@@ -154,7 +154,7 @@ def motion_picture(model: ArmModel, excitation: Excitation) -> str:
 
 
 def postures(model: ArmModel, path: FourierPath | PosturePath, time: Array, closest: Closest | None = None) -> Postures:
-    """Return an arm along a motion with its surroundings, to be drawn.
+    """Return an arm along a motion to be drawn: the places of its joints at these times, obstacles, workspace.
 
     Args:
         model: of the arm.

@@ -57,7 +57,7 @@ def figure(model: ArmModel) -> dict[str, Any]:
 
 
 def view_of_motion(config: ArmConfig, motion: Path | None, speed: float = 1.0) -> dict[str, Any]:
-    """Return an arm along a motion that begins and ends at home.
+    """Return, as JSON values to draw, an arm from home along a motion and back: positions over time, phases, notes.
 
     Args:
         config: of the arm.
@@ -117,7 +117,7 @@ def _grid(begin: float, end: float, rate: float) -> Array:
 
 
 def view_of_recording(config: ArmConfig, path: Path, fmt: RecordingFormat | None = None) -> dict[str, Any]:
-    """Return an arm as it was measured.
+    """Return, as JSON values to draw, an arm with the positions of a recording over time, thinned.
 
     Args:
         config: of the arm.
@@ -147,7 +147,7 @@ def view_of_recording(config: ArmConfig, path: Path, fmt: RecordingFormat | None
 
 
 def view_at_rest(config: ArmConfig) -> dict[str, Any]:
-    """Return an arm at home, for a viewer that is told positions later."""
+    """Return, as JSON values to draw, an arm without positions, for a viewer that is told positions later."""
     return {
         "figure": figure(arm_model(config)),
         "time": [],

@@ -81,7 +81,7 @@ class Backup:
 
 
 def back_up(state: Path, file: Path, *, recordings: bool = True) -> Backup:
-    """Write a backup; a daemon may serve the state folder meanwhile.
+    """Write the state folder into one new file, a backup; a daemon may serve the state folder meanwhile.
 
     Args:
         state: the state folder.

@@ -70,7 +70,7 @@ class Score:
 
 
 def true_parameters(config: ArmConfig, model: ArmModel) -> Array | None:
-    """Return the link parameters of the simulated plant, shape (layout.size,); None without such a plant."""
+    """Return the simulated plant's link parameters, shape (layout.size,); None without a simulated driver."""
     if not isinstance(config.driver, SimulatedDriver):
         return None
     if config.driver.truth is None:
@@ -79,7 +79,7 @@ def true_parameters(config: ArmConfig, model: ArmModel) -> Array | None:
 
 
 def score(estimate: Estimate, truth: Array, plant_motion: Sequence[Truth], unseen: Equations) -> Score:
-    """Score an estimate against the truth.
+    """Compare an estimate with the truth: deviations in sigma, noise-free torque error [%], ratio of residuals.
 
     Args:
         estimate: identified estimate.
@@ -154,7 +154,7 @@ def record_motion(
     path: Path,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> RunReport:
-    """Run one motion on an arm and record it.
+    """Run one motion on an arm, record it into an MCAP file, and return the report, also after a stop.
 
     Args:
         arm: the arm, not yet open.
@@ -189,7 +189,7 @@ def record_motion(
 
 
 def require_clear_from_home(model: ArmModel, motion: Excitation) -> None:
-    """Check that an arm that stands at home may be moved along a motion and back.
+    """Raise MotionRefused unless an arm at home may go along a motion and back within limits and clear.
 
     Raises:
         MotionRefused: it would leave limits, or come too near to something.
@@ -237,7 +237,7 @@ def simulate(
     step: Step = lambda words, share: None,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> Commissioning:
-    """Commission the simulated arm of a configuration, and score the result against its true parameters.
+    """Run both motions on the simulated arm, identify it, write the run folder, and score it against the truth.
 
     Args:
         config: configuration with a simulated driver.

@@ -31,7 +31,7 @@ _PLACES: Final = (RUNS, MOTIONS, DESCRIPTIONS, "arms")
 
 
 def delete_run(db: Database, state: Path, run: str, who: str, *, anyway: bool = False) -> list[Dependent]:
-    """Delete a run: its folder with all recordings, and its report.
+    """Delete a run's folder and report, unless something refers to it or with `anyway`; return what referred to it.
 
     Acceptances keep their copy of its parameters, and operating hours still count it.
 
@@ -58,7 +58,7 @@ def delete_run(db: Database, state: Path, run: str, who: str, *, anyway: bool = 
 
 
 def delete_motion(db: Database, state: Path, motion: str, who: str, *, anyway: bool = False) -> list[Dependent]:
-    """Delete a motion, and the schedules that would run it; runs keep their copy of it. Arguments as `delete_run`."""
+    """Delete a motion, and with `anyway` the schedules that would run it; return these. Arguments as `delete_run`."""
     row = known_motion(db, motion)
     found = [Dependent("schedule", str(one), "deleted") for one in _schedules_of(db, row)]
     _require_idle(f"the motion {motion}", _jobs_about(db, row["arm"], motion))
@@ -68,7 +68,7 @@ def delete_motion(db: Database, state: Path, motion: str, who: str, *, anyway: b
 
 
 def delete_arm(db: Database, state: Path, arm: str, who: str, *, anyway: bool = False) -> list[Dependent]:
-    """Delete an uploaded arm with its motions, runs, schedules and acceptances; arguments as `delete_run`.
+    """Delete an uploaded arm, with `anyway` all its runs, motions, schedules, acceptances too; return these.
 
     A shipped arm of the same name is there again afterwards.
 
@@ -178,7 +178,7 @@ def _require_no_dependents(what: str, found: list[Dependent], *, anyway: bool) -
 
 
 def forget_run(db: Database, state: Path, run: str, who: str) -> None:
-    """Delete a run even if something refers to it: its folder first, then its row; raises UnknownId."""
+    """Delete a run's folder, row and report without asking what refers to it; raises UnknownId."""
     row = known_run(db, run)
     with _hidden([state / RUNS / run]), db.transaction():
         # The operating hours of the run still count for the arm's schedules.

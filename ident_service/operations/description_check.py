@@ -53,18 +53,18 @@ class CheckedDescription:
 
     @property
     def assumed_brakes(self) -> tuple[str, ...]:
-        """Return the joints that would fall but for a brake that only a simulated drive is taken to have."""
+        """Return the joints that would fall and whose brake is not described, but assumed of a simulated drive."""
         joints = self.model.config.joints
         return tuple(name for name in self.falling if name not in joints or joints[name].brake is None)
 
     @property
     def good(self) -> bool:
-        """Return whether nothing stands against what the description is for: identification, or motion."""
+        """Return whether there are no objections; `missing`, what only a motion would need, does not count."""
         return not self.objections
 
 
 def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescription:
-    """Check a description: load it, build its model, and judge bus budget, gains and stop behaviour.
+    """Load a description, build its model, judge bus budget, gains and stop behaviour; return what was found.
 
     Args:
         arm: file of the description, or name of a shipped one.

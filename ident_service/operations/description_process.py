@@ -27,7 +27,7 @@ _NEW, _DRAW = "new", "draw"  # the words for the second thing, and the third
 
 
 def judge_apart(path: Path) -> dict[str, Any]:
-    """Judge an uploaded description in a separate process.
+    """Judge an uploaded description in a separate process; return `good`, `stable`, `objections`, `text` and more.
 
     Returns:
         `arm`, `sha256`, `good`, `stable`, `objections` and `text`.
@@ -43,7 +43,7 @@ def judge_apart(path: Path) -> dict[str, Any]:
 
 
 def describe_apart(path: Path, name: str) -> dict[str, Any]:
-    """Write a first description of an uploaded URDF in a separate process.
+    """Make a description of an uploaded URDF in a separate process; return it, its files, and what was guessed.
 
     Args:
         path: path of the URDF, its meshes beside it.
@@ -162,7 +162,7 @@ def _require_own_meshes(source: Path) -> None:
 
 
 def main(words: list[str]) -> int:
-    """Judge or draw the description file that the first argument names, or describe the URDF there."""
+    """Judge or draw the description file named first, or describe the URDF there; print the answer as JSON."""
     if words[1:2] == [_NEW]:
         return answer_within(MOST_MEMORY, _NEW_SECONDS, lambda: _new_document(Path(words[0]), words[2]))
     if words[1:2] == [_DRAW]:

@@ -29,7 +29,7 @@ class Verdict:
 
 
 def verdict_of(document: Mapping[str, Any]) -> Verdict:
-    """Return the verdict of a comparison of two parameter sets.
+    """Return state and words of the verdict in a `comparison.json`: findings, torque errors on the recording.
 
     Args:
         document: `comparison.json`.
@@ -51,7 +51,7 @@ def _finding(one: Mapping[str, Any]) -> str:
 
 
 def raise_alarm(db: Database, arm: str, reidentification: str, run: str, what: str, now: float) -> None:
-    """Enter a drift alarm.
+    """Write a new open drift alarm into the registry and the audit trail.
 
     Args:
         db: the registry.
@@ -70,10 +70,10 @@ def raise_alarm(db: Database, arm: str, reidentification: str, run: str, what: s
 
 
 def raise_fleet_alarms(db: Database, document: Mapping[str, Any], made: str, now: float) -> None:
-    """Enter a drift alarm for each change that a fleet shows and that was not told before.
+    """Raise an alarm for each change in a fleet unless one for it is open or was raised since the change.
 
-    A change was told if an alarm of that arm and group stands, or was raised by a fleet after the change. What goes on
-    drifting after somebody acknowledged it is told again.
+    An alarm is for the change if it is of that arm and group, and is open or was raised after the change. What goes on
+    drifting after somebody acknowledged it raises another one.
 
     Args:
         db: the registry.
@@ -108,7 +108,7 @@ def alarms(
 
 
 def acknowledge_alarm(db: Database, number: int, remark: str, by: str, now: float) -> Row:
-    """Close an alarm that a person has acknowledged.
+    """Close an open alarm with the remark of a person who acknowledges it; return its row.
 
     Raises:
         UsageError: no note.
@@ -127,5 +127,5 @@ def acknowledge_alarm(db: Database, number: int, remark: str, by: str, now: floa
 
 
 def end_alarms(db: Database, arm: str, how: str, by: str, now: float) -> None:
-    """Close the alarms of an arm whose accepted set has been replaced."""
+    """Close all open alarms of an arm: its accepted set has been replaced, as `how` says."""
     db.write("UPDATE alarms SET closed = ?, closed_by = ?, how = ? WHERE arm = ? AND closed IS NULL", now, by, how, arm)

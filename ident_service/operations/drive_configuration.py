@@ -54,7 +54,7 @@ class PlannedDrive:
 def planned_configuration(
     config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_links
 ) -> tuple[PlannedDrive, ...]:
-    """Return what opening an arm would write into its drives, by SDO uploads alone.
+    """Return what opening an arm would write into each of its drives; the drives are only read, by SDO uploads.
 
     Args:
         config: of the arm.
@@ -91,7 +91,7 @@ def planned_configuration(
 def planned_zero(
     config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_links
 ) -> tuple[PlannedDrive, ...]:
-    """Return what setting the present posture as home would write into an arm's drives, by SDO uploads alone.
+    """Return what setting the present posture as home would write into each drive; the drives are only read.
 
     Args:
         config: of the arm.
@@ -133,7 +133,7 @@ def _fixed(sheet: DataSheet) -> frozenset[int]:
 
 
 def require_drives(config: ArmConfig, why: str = "only CANopen drives are configured") -> CanopenDriver:
-    """Return the driver's section of an arm; raises UsageError with `why` where its drives are not CANopen's."""
+    """Return the `driver` section of an arm if it is CANopen; else raise UsageError with the words `why`."""
     if isinstance(config.driver, CanopenDriver):
         return config.driver
     kind = "no driver" if config.driver is None else f"driver {config.driver.kind!r}"
@@ -189,7 +189,7 @@ def import_configuration(
     dry: bool,
     open_bus: Callable[[ArmConfig], list[Link]] = open_links,
 ) -> tuple[ImportedDrive, ...]:
-    """Write the values that DCFs give to drives, one file for each drive in the arm's order.
+    """Write the values of one DCF per drive into the drives, or with `dry` only list them; return the changes.
 
     A drive that refuses one of them, or keeps another value, is set back to what it held, and so are those before it;
     so are all after an interrupt or any other error. The error says so, itself or in a note.
@@ -368,7 +368,7 @@ def _is_set_back(objects: Objects, change: Change) -> bool:
 def store_or_restore(
     config: ArmConfig, *, store: bool, dry: bool = False, open_bus: Callable[[ArmConfig], list[Link]] = open_links
 ) -> tuple[int, ...]:
-    """Make all drives store their configuration (1010h), or restore that of their delivery (1011h).
+    """Make all drives store their configuration (1010h) or restore the delivered one (1011h); return their nodes.
 
     What is restored takes effect when the drives' power has been switched off and on.
 
@@ -415,7 +415,7 @@ def store_or_restore(
 
 
 def imported_text(config: ArmConfig, found: Sequence[ImportedDrive], *, dry: bool) -> str:
-    """Format an import as text, with a last line break."""
+    """Format what an import has changed, or would change, in each drive as text, with a last line break."""
     lines = [f"{config.name}: {'what importing would change; nothing was written' if dry else 'imported'}"]
     for one in found:
         lines += ["", f"drive {one.drive}, node {one.node}, by {one.file}: {len(one.changes)} entries changed"]
@@ -426,7 +426,7 @@ def imported_text(config: ArmConfig, found: Sequence[ImportedDrive], *, dry: boo
 
 
 def planned_text(config: ArmConfig, planned: Sequence[PlannedDrive], what: str = "opening") -> str:
-    """Format a dry run of something, in words, as text, with a last line break."""
+    """Format what an action, named in words, would write into each drive as text, with a last line break."""
     lines = [f"{config.name}: what {what} would write; nothing was written, and nothing moved"]
     for one in planned:
         lines += ["", f"drive {one.drive}, node {one.node}: {_count(one)}", *_change_lines(one.changes)]
@@ -455,7 +455,7 @@ def _hex(change: Change, value: int) -> str:
 def drives_document(
     config: ArmConfig, drives: Sequence[PlannedDrive | ImportedDrive], *, written: bool = False
 ) -> dict[str, Any]:
-    """Return a dry run or an import as JSON values."""
+    """Return the changes of each drive by a dry run or an import as JSON values."""
     shown = [vars(one) | {"changes": list(map(_document, one.changes))} for one in drives]
     return {"arm": config.name, "written": written, "drives": shown}
 

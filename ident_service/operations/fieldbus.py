@@ -60,7 +60,7 @@ _UNDER = f"  {'':<53}{'least':>8}{'typical':>8}{'worst':>8}{'least':>8}{'typical
 
 
 def bus_load(config: ArmConfig, rate: float | None = None) -> Budget:
-    """Return what an arm's frames cost on its buses.
+    """Return the load of each CAN bus of an arm by its frames at a rate, and whether it fits.
 
     Args:
         config: the arm's.
@@ -77,7 +77,7 @@ def bus_load(config: ArmConfig, rate: float | None = None) -> Budget:
 
 
 def require_budget(arm: str | Path, config: ArmConfig) -> Budget | None:
-    """Return the bus budget of an arm with drives on CAN, which must fit; None for other arms.
+    """Return the bus budget of an arm with drives on CAN; None for other arms. One that does not fit raises.
 
     Args:
         arm: file of the description, or name of a shipped one.
@@ -95,7 +95,7 @@ def require_budget(arm: str | Path, config: ArmConfig) -> Budget | None:
 
 
 def bus_lines(found: Budget) -> str:
-    """Format the verdict as one line per bus."""
+    """Format load and highest rate of each bus as one line a bus."""
     return "".join(
         f"bus {bus.number} ({bus.bus.channel}): {100 * bus.load.worst:.1f} % worst,"
         f" {100 * bus.load.typical:.1f} % typical at {found.rate:g} Hz; up to {bus.highest_rate} Hz\n"
@@ -104,7 +104,7 @@ def bus_lines(found: Budget) -> str:
 
 
 def bus_text(name: str, found: Budget) -> str:
-    """Format the budget as text, with a last line break."""
+    """Format whether the budget fits, the load of each bus and remedies as text, with a last line break."""
     lines = [f"{name} at {found.rate:g} Hz: {'fits' if found.fits else 'DOES NOT FIT'}"]
     for bus in found.buses:
         lines += ["", *_bus_lines(bus)]
@@ -237,7 +237,7 @@ class Scan:
 
 
 def bus_scan(config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_links) -> Scan:
-    """Find and identify the nodes on every bus of an arm; nothing is changed.
+    """Find the nodes on every bus of an arm and compare each with the description; nothing is changed.
 
     Args:
         config: the arm's.
@@ -368,7 +368,7 @@ class Probed:
 
     @property
     def drivable(self) -> bool:
-        """Return whether the drive can be driven as the description stands."""
+        """Return whether the drive answered, and can be driven without any change of the description."""
         return self.can is not None and not (self.silent or self.can.problems or self.can.changes)
 
 
@@ -411,7 +411,7 @@ def bus_probe(
     files: Sequence[TextFile] = (),
     open_bus: Callable[[ArmConfig], list[Link]] = open_links,
 ) -> Probe:
-    """Read the capabilities of an arm's drives; nothing is changed.
+    """Read what an arm's drives can do, or what the data sheets `files` say, and judge it; nothing is changed.
 
     Args:
         config: the arm's.
@@ -479,7 +479,7 @@ def _capabilities_from_sheet(driver: CanopenDriver, number: int, file: TextFile)
 
 
 def cut_sheets(config: ArmConfig) -> tuple[str, ...]:
-    """Return the data sheets of drives that seem to be cut off, in words."""
+    """Return a sentence for each data sheet of a drive that seems to be cut off; none for drives without sheets."""
     if not isinstance(config.driver, CanopenDriver):
         return ()
     files = dict.fromkeys(config.driver.sheet_file(number) for number in range(len(config.driver.drives)))
@@ -507,7 +507,7 @@ def probe_text(config: ArmConfig, found: Probe) -> str:
 
 
 def probe_advice(found: Probe) -> list[str]:
-    """Return what to do about drives or files that cannot be driven as described, one sentence for all alike."""
+    """Return what helps where drives or files cannot be driven as described, one sentence for all that are alike."""
     advice: dict[str, list[str]] = {}
     for one in found.probed:
         if not one.drivable:
@@ -642,7 +642,7 @@ _KEPT_FORMAT = "ident-drives"
 
 
 def keep_outcome(path: Path, document: dict[str, Any]) -> list[str]:
-    """Keep what a probe found of an arm's drives, and return what differs from the probe before, in words.
+    """Store in a file what a probe found of an arm's drives; return what differs from the probe before, in words.
 
     Args:
         path: of the file, one for each arm.
@@ -706,7 +706,7 @@ def bus_report(
     frames: Path | None = None,
     open_bus: Callable[[ArmConfig], list[Link]] = open_links,
 ) -> list[str]:
-    """Write a ZIP file with what helps others to see why drives do not work: no secret, no name of a person or machine.
+    """Write a ZIP file to find out why drives do not work, without secrets and names; return its files' names.
 
     Drives are only read. Where they cannot be, the report says why.
 

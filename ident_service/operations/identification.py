@@ -119,7 +119,7 @@ def identify_files(
     tell: Callable[[str], None] = lambda _: None,
     step: Step = lambda words, share: None,
 ) -> IdentificationResult:
-    """Identify an arm from files and write the results.
+    """Identify an arm from recordings, and write the results into a folder, in place of an earlier result there.
 
     Args:
         request: recordings and options.
@@ -225,7 +225,7 @@ _AT_REST = 0.99  # share of the time at standstill of a recording that shows not
 
 
 def custom_of(arm: str, config: ArmConfig) -> CustomFunction | None:
-    """Load the function that a description names as `constraints.custom`, from beside it or from `sys.path`.
+    """Load the function that a description names as `constraints.custom`; None where it names none.
 
     Args:
         arm: description file or name of a shipped one.

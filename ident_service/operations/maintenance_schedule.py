@@ -39,7 +39,7 @@ class Cron:
     text: str
 
     def after(self, at: float) -> float:
-        """Return the first instant after `at`; both [s since 1970 in UTC].
+        """Return the first time after `at` that the five fields match; both [s since 1970 in UTC].
 
         Raises:
             UsageError: no such day comes within fifty years.
@@ -51,7 +51,7 @@ class Cron:
 
 
 def parse_cron(text: str) -> Cron:
-    """Parse cron's five fields: minute, hour, day of month, month, day of week.
+    """Parse and check cron's five fields: minute, hour, day of month, month, day of week; others raise UsageError.
 
     Raises:
         UsageError: they are not; the message names the field.
@@ -93,7 +93,7 @@ class DueRule:
 
 
 def add_schedule(db: Database, arm: str, when: DueRule, by: str, now: float, motion: str | None = None) -> Row:
-    """Add a schedule that counts from now.
+    """Add a schedule of re-identification that counts from now; return its row.
 
     Args:
         db: the registry.
@@ -138,7 +138,7 @@ def schedules(db: Database, arm: str | None = None) -> list[Row]:
 
 
 def known_schedule(db: Database, number: int) -> Row:
-    """Return the schedule of this number.
+    """Return the row of the schedule of this number; raise UnknownId where there is none.
 
     Raises:
         UnknownId: there is none.
@@ -180,7 +180,7 @@ def remove_schedule(db: Database, number: int, by: str) -> None:
 
 
 def add_event(db: Database, arm: str, what: str, remark: str, by: str, now: float) -> Row:
-    """Enter maintenance that was done; schedules that follow maintenance become due.
+    """Enter maintenance that was done; mark the schedules that follow maintenance as due; return its row.
 
     Args:
         db: the registry.
@@ -260,12 +260,12 @@ def _falls_due(db: Database, row: Row, cause: str, now: float, *, late: bool = F
 
 
 def pending(db: Database, arm: str | None = None) -> list[Row]:
-    """Return what is due and has not been done, the earliest first."""
+    """Return the re-identifications that are due and neither done nor dismissed, the earliest first."""
     return db.rows("SELECT * FROM dues WHERE closed IS NULL AND (? IS NULL OR arm = ?) ORDER BY id", arm, arm)
 
 
 def pending_with_accepted(db: Database, state: Path, arm: str | None = None) -> list[dict[str, Any]]:
-    """Return what is due, as `pending`; `accepted` says whether the arm has a set to compare with."""
+    """Return the rows of `pending`, each with `accepted`: whether the arm has an accepted set to compare with."""
     return [{**row, "accepted": bool(acceptances(state, row["arm"]))} for row in pending(db, arm)]
 
 

@@ -43,7 +43,7 @@ _SAMPLES, _POSTURES = 6000, 400
 
 
 def drawings(seen: Preview) -> dict[str, str]:
-    """Return the SVG files of a preview, by name."""
+    """Draw a preview, joints over time and postures; return the SVG texts by file name."""
     name = f"{seen.excitation.name} motion of {seen.model.config.name}"
     pictures = (joints_over_time(_traces(seen), name), stick_figure(_postures(seen), name))
     return dict(zip(DRAWINGS, pictures, strict=True))
@@ -142,7 +142,7 @@ def design_files(
     tell: Callable[[Progress], None] = lambda _: None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> tuple[Designed, Preview]:
-    """Search for a motion and write the motion, the search, and a preview.
+    """Search for a motion; write the motion, the search and a preview into a folder; return motion and preview.
 
     Args:
         request: description, data and options.
@@ -197,7 +197,7 @@ def design_files(
 
 
 def preview_files(arm: str, motion: Path | None, knowledge: PriorData, folder: Path | None) -> Preview:
-    """Preview a motion, and write text and drawings where a folder is given.
+    """Predict how a motion goes and what it teaches; write text, values and drawings where a folder is given.
 
     Args:
         arm: description file, or the name of a shipped one.
@@ -252,7 +252,7 @@ def known_noise(model: ArmModel, knowledge: PriorData) -> NoiseModel:
 
 
 def known_information(model: ArmModel, base: BaseParameters, knowledge: PriorData, noise: Array) -> Array | None:
-    """Return the information of the recordings, whitened by `noise` of shape (joints,); None without any."""
+    """Return the information of earlier recordings, whitened by `noise` (joints,), (base, base); None without any."""
     if not knowledge.recordings:
         return None
     opened = open_together(knowledge.recordings, model).recordings

@@ -82,7 +82,7 @@ class Preview:
 def preview(
     model: ArmModel, excitation: Excitation, noise: NoiseModel | None = None, added: Array | None = None
 ) -> Preview:
-    """Predict a motion before anything moves.
+    """Predict peaks, clearances, stops and deviations of a motion, and list what forbids it; nothing moves.
 
     Args:
         model: of the arm, with prior parameters.
@@ -184,7 +184,7 @@ def _following(model: ArmModel, excitation: Excitation, limits: MotionLimits) ->
 
 
 def recorded_noise(file: Path, model: ArmModel) -> NoiseModel:
-    """Return the noise model from an earlier identification of the arm.
+    """Return the torque noise of each joint, from the residuals of an earlier identification of the arm.
 
     Per joint the residual's root mean square; and by how much the deviations found in blocks exceed those that white
     noise would give, in the geometric mean.

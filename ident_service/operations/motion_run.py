@@ -89,7 +89,7 @@ class ProcessResult:
         return bool(self.report or self.error)
 
     def raise_for(self, faults: FaultStore) -> None:
-        """Raise the error that the motion process reported; faults that followed the first are added as notes.
+        """Raise the error that the motion process reported, or how it died; return where it reported a run.
 
         Raises:
             ArmFault: the fault that was latched first, which is the cause of the others.
@@ -137,7 +137,7 @@ def supervise_motion_process(
     stop_requested: Callable[[], bool],
     finish_requested: Callable[[], bool] = lambda: False,
 ) -> ProcessResult:
-    """Start the motion process, keep its lease, and read its output until it ends.
+    """Start the motion process, renew its lease until it ends, and return what it reported and its exit code.
 
     Args:
         request: request to the motion process (`motion/process.py`).
@@ -294,7 +294,7 @@ _MOST = 4096  # bytes that are read at once
 
 
 def require_target(target: Target, model: ArmModel) -> None:
-    """Check that an accuracy target can be watched.
+    """Raise UsageError unless a target's share is between 0 and 1 and its parameters are the arm's.
 
     Raises:
         UsageError: a share not between 0 and 1, or a parameter that is none of the arm's.
@@ -406,7 +406,7 @@ def run_motion(
     requested_ns: int | None = None,
     until: Target | None = None,
 ) -> RunResult:
-    """Move an arm along a motion, or to a destination, and record it.
+    """Move an arm along a motion, or to a destination, by a valid ticket, and record it into a new folder.
 
     Args:
         config: of the arm.

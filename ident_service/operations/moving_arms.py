@@ -26,7 +26,7 @@ Asked = Literal["pause", "resume", "finish", "supported"]
 
 
 def ask_process(path: Path, asked: Asked) -> int:
-    """Ask the process that holds an arm's control file; return its id.
+    """Write a request into a control file, for the process that holds it; return its id; does not wait for it.
 
     Args:
         path: of the control file.
@@ -47,7 +47,7 @@ def ask_process(path: Path, asked: Asked) -> int:
 
 
 def ask_arm(state: Path, arm: str, asked: Asked) -> bool:
-    """Ask the process that moves or holds an arm, as `ask_process`; return whether there was one."""
+    """Send `pause`, `resume` or such to the process that moves or holds an arm; return whether there was one."""
     return bool(_reach(state, arm, lambda path: ask_process(path, asked)))
 
 

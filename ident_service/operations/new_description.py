@@ -258,7 +258,7 @@ def new_description(
     tell: Callable[[str], None] = lambda _: None,
     convention: str | None = None,
 ) -> tuple[Path, tuple[str, ...]]:
-    """Write the description of an arm, and beside it a copy of its URDF or MJCF, and the schema for editors.
+    """Write an arm's description, a copy of its URDF or MJCF, and the schema; return (path, what was guessed).
 
     Args:
         source: a URDF, an MJCF, or a DH table as CSV or YAML.
@@ -268,9 +268,6 @@ def new_description(
         tip: link that it ends at; before the gripper of the longest branch when None.
         tell: called with a line at each step.
         convention: convention of a DH table that does not name its own, `standard` or `modified`.
-
-    Returns:
-        The description's path, and what was guessed.
 
     Raises:
         UsageError: no such file, or something is there where it would be written.

@@ -83,7 +83,7 @@ class CorrectedFile:
 def check_file(
     path: Path, kind: FeasibleSetName | None = None, arm: str | None = None, notation: Notation | None = None
 ) -> CheckedFile:
-    """Test the feasibility of a parameter file (BPFT, eq. 51).
+    """Test if some point of a feasible set has the base values of a parameter file (BPFT, eq. 51).
 
     Args:
         path: the file.
@@ -201,14 +201,11 @@ KEPT = (DOCUMENT, TEXT, PAGE)
 
 
 def compare_files(paths: Sequence[Path], out: Path | None = None) -> tuple[Comparison, tuple[Path, ...]]:
-    """Compare folders of results or parameter files; the first is the reference.
+    """Compare results with the first of them; return (comparison, files written, none without `out`).
 
     Args:
         paths: two or more.
         out: a file that ends in `.json`, or a folder for everything; nothing is written when None.
-
-    Returns:
-        The comparison, and the files written.
 
     Raises:
         UsageError: fewer than two, one that is not there, or `out` cannot be written.
@@ -230,7 +227,7 @@ def compare_files(paths: Sequence[Path], out: Path | None = None) -> tuple[Compa
 
 
 def compare_into(reference: Path, folder: Path) -> Comparison:
-    """Compare a folder of results with a reference, and store the comparison in it, named by its manifest.
+    """Compare a folder of results with a reference; store the comparison in the folder and its manifest anew.
 
     A kill in between leaves files that the manifest does not name, and which are therefore ignored.
 
@@ -248,7 +245,7 @@ def compare_into(reference: Path, folder: Path) -> Comparison:
 
 
 def write_comparison_files(folder: Path, comparison: Comparison) -> tuple[str, ...]:
-    """Write a comparison in every form into a folder that exists; returns the names."""
+    """Write a comparison as JSON, text and HTML into a folder that exists; return the names."""
     write_comparison(folder / DOCUMENT, comparison)
     write_atomically(folder / TEXT, comparison_text(comparison))
     write_atomically(folder / PAGE, comparison_html(comparison))
@@ -334,7 +331,7 @@ def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_off
 
 
 def known_arm(side: ComparedSet) -> KnownArm:
-    """Return the identified arm of a folder of results.
+    """Return model, base parameters and covariance of the arm that was identified in a folder of results.
 
     Raises:
         ParameterError: the parameters have no covariance, or belong to another mechanism.

@@ -37,7 +37,7 @@ _OF_ALL = ("gap", "stamps", "rate")
 
 
 def file_and_range(path: Path) -> tuple[Path, tuple[float, float] | None]:
-    """Split `FILE@START:END` into file and seconds, either of which may be left out, unless such a file exists.
+    """Split `FILE@START:END` into (file, (start, end) [s]); the latter None without a range or for such a file.
 
     Raises:
         UsageError: the range ends before it begins.
@@ -73,7 +73,7 @@ def open_together(
     torque: Torque | None = None,
     payloads: Mapping[Path, Payload] = MappingProxyType({}),
 ) -> OpenedRecordings:
-    """Open recordings for one estimate, with the same kind of torque in all that ident recorded.
+    """Open recordings for one estimate: with measured torques if all have them, else with commanded ones.
 
     Torques that drives measured and commanded ones differ by the error of the current loops, and each has its
     own delay. So measured ones are used where all recordings have them, and commanded ones otherwise.
@@ -129,7 +129,7 @@ def open_for_arm(
     torque: Torque | None = None,
     payload: Payload | None = None,
 ) -> Recording:
-    """Open a recording, or a range of one, for an arm.
+    """Open a recording, or a range of one, for an arm, without what followed where the motion was stopped.
 
     Args:
         path: the file, or `FILE@START:END`.
@@ -185,7 +185,7 @@ def _ended(whole: McapRecording | MeasuredRecording, recording: Recording) -> fl
 def own_formats(
     columns: Mapping[Path, Path], recordings: Sequence[Path], model: ArmModel
 ) -> dict[Path, RecordingFormat]:
-    """Read the columns files that each belong to one recording.
+    """Read the columns files that each belong to one recording; map the recording to its format.
 
     Args:
         columns: the columns file of each recording.
@@ -220,7 +220,7 @@ def own_formats(
 
 
 def known_payloads(files: Mapping[Path, Path], recordings: Sequence[Path], model: ArmModel) -> dict[Path, Payload]:
-    """Read the files of known payloads.
+    """Read the files of known payloads; map each recording that has one to its payload.
 
     Args:
         files: file of each recording that has one: YAML with the keys of a description's section `payload`.
@@ -252,7 +252,7 @@ def removed_standstill(recording: Recording) -> tuple[float, float]:
 
 
 def require_no_fault(path: Path, recording: Recording) -> None:
-    """Refuse a recording made by ident in which a fault stopped the arm, unless its range ends before.
+    """Raise RecordingError if ident recorded it and a fault stopped the arm within the range that is read.
 
     Args:
         path: path of the recording as it was named.

@@ -125,7 +125,7 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str 
 
 
 def release_held_drives(config: ArmConfig, state: Path) -> tuple[str, ...]:
-    """Switch off drives that hold an arm in quick stop, once a person has confirmed that it is supported.
+    """Switch off drives that hold an arm in quick stop, which a person has confirmed as supported; return the axes.
 
     Args:
         config: of the arm.
@@ -270,7 +270,7 @@ class ZeroingResult:
 
 
 def home_posture(config: ArmConfig) -> tuple[JointPosture, ...]:
-    """Return the posture in which an arm is zeroed.
+    """Return the home position of every joint, in which the arm must stand for set-home (`zero: at_home`).
 
     Raises:
         UsageError: its description does not say `zero: at_home`, or has no home of every joint.
@@ -291,7 +291,7 @@ def home_posture(config: ArmConfig) -> tuple[JointPosture, ...]:
 
 
 def set_home(config: ArmConfig, state: Path, confirm: Callable[[str], str], arm: Arm | None = None) -> ZeroingResult:
-    """Set an arm's present position as its home in the drives, once a person has confirmed the posture.
+    """Set an arm's present position as its home in the drives if a person confirms it; delete the arm's ticket.
 
     Args:
         config: of the arm.

@@ -26,7 +26,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,119}")
 
 
 def import_run(db: Database, state: Path, folder: Path, who: str) -> Row:
-    """Import a run folder into the state folder and the registry.
+    """Verify a run folder, copy it into the state folder and enter it in the registry; return its row.
 
     Args:
         db: the registry.
@@ -94,7 +94,7 @@ class PrunableRecording:
 
 
 def prunable_recordings(db: Database, state: Path, newest: int) -> list[PrunableRecording]:
-    """Return the recordings that `prune` would delete.
+    """Return the recordings that `prune` would delete: of older runs, needed by no acceptance and no job.
 
     Kept are those of accepted runs, those of other runs that an accepted set was identified from or judged on, those of
     each arm's `newest` runs, and those that a waiting or running job makes or reads.
@@ -136,7 +136,7 @@ def _busy(db: Database) -> set[str]:
 
 
 def prune(db: Database, state: Path, newest: int, who: str) -> list[PrunableRecording]:
-    """Delete the recordings that `prunable_recordings` returns; rows are marked first: a kill does no damage."""
+    """Delete the recordings that `prunable_recordings` returns, and return them; a kill on the way does no damage."""
     gone = prunable_recordings(db, state, newest)
     for one in gone:
         with db.transaction():

@@ -29,7 +29,7 @@ _IN_A_ROW = 2  # consecutive steps below the target: deviations are estimates, a
 
 
 def main() -> int:
-    """Follow the recording, and print one line of JSON if the target is reached; return 0."""
+    """Read a request from stdin, follow the run's recording, and print one JSON line if the target is reached."""
     os.nice(19)
     request = json.loads(sys.stdin.readline())
     if said := watch(Path(request["folder"]), Target(request["share"], tuple(request["parameters"])), request["least"]):
@@ -38,7 +38,7 @@ def main() -> int:
 
 
 def watch(folder: Path, target: Target, least: float) -> dict[str, Any] | None:
-    """Wait until the target is reached; return seconds of the motion and largest share then, None if it was not.
+    """Follow a run's recording until the target is reached; return `seconds` and `share` then, None if it ends before.
 
     Args:
         folder: of the run.
@@ -70,7 +70,7 @@ def watch(folder: Path, target: Target, least: float) -> dict[str, Any] | None:
 
 
 def missed(folder: Path, target: Target, period: float) -> list[dict[str, Any]]:
-    """Return which of the chosen parameters the whole recording of a run does not determine as well as asked.
+    """Return expression and share of the chosen parameters that a run's whole recording leaves less known than asked.
 
     Args:
         folder: folder of the run, which is over.

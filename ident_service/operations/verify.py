@@ -19,7 +19,7 @@ _CHANGEABLE = frozenset({"identification", "recording", "driver"})
 
 
 def verify_file(path: Path, arm: str | None = None) -> Verification:
-    """Check the certificate of a parameter file in exact arithmetic.
+    """Check a certificate in exact arithmetic against an arm's conditions, or else the file's own; return the verdict.
 
     Args:
         path: the file, or a folder of results.

@@ -112,7 +112,7 @@ class JointResponse:
 
 
 def strokes(session: Session, model: ArmModel, limits: MotionLimits, only: int | None = None) -> list[TestMotion]:
-    """Plan a small test motion for every joint, or for one, by number.
+    """Plan a small test motion, there and back, for every joint, or for the one of number `only`.
 
     Raises:
         MotionRefused: a joint has no room within its position limits or its surroundings.
@@ -139,7 +139,7 @@ def strokes(session: Session, model: ArmModel, limits: MotionLimits, only: int |
 
 
 def follow_stroke(session: Session, stroke: TestMotion) -> tuple[Rows, Rows]:
-    """Move one joint there and back three times: twice to learn its friction, the second time shaken, and once more.
+    """Move one joint there and back three times; return the cycles of the third time, and of the second, shaken one.
 
     Returns:
         The cycles of the last time, and of the time before, when the joint was shaken on its way (`delay.py`).
@@ -156,7 +156,7 @@ def follow_stroke(session: Session, stroke: TestMotion) -> tuple[Rows, Rows]:
 
 
 def judge_response(trace: Trace, stroke: TestMotion, session: Session) -> JointResponse:
-    """Evaluate a test motion that the loop could follow to its end."""
+    """Return what a complete test motion shows: displacement and response to torque over those expected, and doubt."""
     answers, doubt = _response_to_torque(trace, stroke.joint, session)
     return JointResponse(_displaced(trace, stroke) / stroke.amplitude, answers, doubt)
 
@@ -211,7 +211,7 @@ def moved_against_torque(trace: Trace, joint: int, session: Session) -> bool:
 
 
 def swings(trace: Trace, joint: int) -> bool:
-    """Return whether a joint has been far from its reference on either side, as one never is whose sign is wrong.
+    """Return whether a joint was far from its reference on both sides: an unstable loop swings, a wrong sign does not.
 
     A loop that is not stable swings, and by its delay seems to move against its torque.
     """
@@ -220,7 +220,7 @@ def swings(trace: Trace, joint: int) -> bool:
 
 
 def wrong_signs(trace: Trace, session: Session) -> list[int]:
-    """Return the joints whose wrong sign explains how the guard ended a loop.
+    """Return the indices of the joints whose wrong sign of torque or position explains how the arm moved.
 
     Measured displacements against the twice integrated accelerations that the model expects, constant torques that the
     model does not know (gravity's for example) taken out on both sides. Joints are coupled, so that one wrong sign
@@ -276,7 +276,7 @@ def sign_failure(joints: Sequence[int], model: ArmModel, why: str) -> Check:
 def direction_check(
     answers: Sequence[JointResponse], model: ArmModel, session: Session, delays: Sequence[Delay] = ()
 ) -> Check:
-    """Evaluate all test motions of a session, and the delays measured on them, as one check."""
+    """Return the check `direction`: joints follow, answer torque as predicted, and hide no unknown delay."""
     names, ones = model.chain.names, ("",) * model.chain.joints
     nothing = np.zeros(len(names))
     follows = np.array([one.follows for one in answers])
@@ -424,7 +424,7 @@ REMEDY = (
 
 
 def holdable(gravity: Vector, model: ArmModel, limits: MotionLimits) -> Check | None:
-    """Return a failed check where the model says that the arm cannot be held in this posture; else None.
+    """Return a failed check if the model's gravity torque takes too much of a torque limit; else None.
 
     Args:
         gravity: the model's torque where the arm stands [N m or N], shape (joints,).
@@ -462,14 +462,14 @@ def holding_torque(rows: Rows, period: float) -> Vector:
 def differences(
     held: Vector, gravity: Vector, limits: MotionLimits, friction: ExpectedFriction
 ) -> tuple[Vector, Vector]:
-    """Return how far two torques are apart, and how far they may be [N m or N], shape (joints,) each."""
+    """Return |held - gravity|, and the most that it may be by torque limit and friction [N m or N], (joints,) each."""
     return np.abs(held - gravity), GRAVITY_ERROR * limits.torque + friction.coulomb
 
 
 def gravity_check(
     held: Vector, gravity: Vector, model: ArmModel, limits: MotionLimits, friction: ExpectedFriction
 ) -> Check:
-    """Compare the torque that held the arm with the model's gravity torque.
+    """Return the check `gravity`: failed where holding torque and model differ by more than `differences` allows.
 
     Args:
         held: `holding_torque` [N m or N], shape (joints,).
@@ -495,7 +495,7 @@ def gravity_check(
 def holding_fault_check(
     session: Session, model: ArmModel, limits: MotionLimits, friction: ExpectedFriction, error: ArmFault
 ) -> Check:
-    """Find out why a fault ended the holding of an arm.
+    """Return the failed check `gravity`, with why a fault ended the holding of the arm: fault, sign or load.
 
     Causes: a wrong sign that explains how the arm moved; what the fault itself says; or a load: an arm that sinks,
     although the torque that holds it is above the model's. Its joints stick on the way, like a frozen encoder.

@@ -44,7 +44,7 @@ class Delay:
 
 
 def dither(session: Session, limits_torque: Vector, joint: int) -> Vector:
-    """Return the amplitude of a sinusoidal torque on one joint [N m or N], (joints,); zero in too slow a loop."""
+    """Return the amplitude of a sinusoidal test torque on one joint [N m or N], (joints,); zero in too slow a loop."""
     if FREQUENCY * session.period > 1.0 / _LEAST_SAMPLES:
         return np.zeros(len(limits_torque))
     pace = 2.0 * np.pi * FREQUENCY
@@ -54,7 +54,7 @@ def dither(session: Session, limits_torque: Vector, joint: int) -> Vector:
 
 
 def hidden_delay(trace: Trace, expected: Vector, joint: int) -> Delay | None:
-    """Measure the hidden delay; None where the joint did not slide for long enough, or did not respond.
+    """Return a joint's hidden delay and its deviation [s]; None where it did not slide long enough, or respond.
 
     With a the measured and b the expected acceleration, both through one filter, `a(t) = g b(t - d) + friction`, and so
     `a = g b - g d db/dt + f_c sign(v) + f_v v + c` to first order.
@@ -95,7 +95,7 @@ def hidden_delay(trace: Trace, expected: Vector, joint: int) -> Delay | None:
 
 
 def delay_measures(delays: Sequence[Delay], model: ArmModel, period: float) -> list[Measure]:
-    """Compare the delay of all joints together with the configured one (`identification.delay`).
+    """Return the hidden delay of all joints together as a measure, limited if it is well known, and that of each.
 
     Each joint's own delay is told, too. Nothing is judged where all together do not know it to `_SURE` of a cycle.
     """

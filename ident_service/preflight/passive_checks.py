@@ -78,7 +78,7 @@ class IdleRecording:
 def record_idle(
     arm: Arm, cycles: int, period: float, work: Callable[[Sample], None] = lambda sample: None
 ) -> IdleRecording:
-    """Record cycles of an open arm without torque.
+    """Exchange cycles with an open arm without torque; return their samples and the times of waking.
 
     Args:
         arm: open.
@@ -105,7 +105,7 @@ def identities_check(
     looked: IdleRecording,
     setup: Sequence[SetupCheck] = (),
 ) -> Check:
-    """Check that every axis answers, and is the drive that the description means.
+    """Return the check `identities`: joints, drives, answers, torque limits and rate are those of the description.
 
     Args:
         described: description by the open arm.
@@ -170,7 +170,7 @@ def identities_check(
 def at_rest_check(
     looked: IdleRecording, model: ArmModel, limits: MotionLimits, closed: LastPosition | None = None
 ) -> Check:
-    """Check that the arm stands still without torque, inside its limits, and no motor whole turns elsewhere.
+    """Return the check `at_rest`: no drift without torque, inside position limits, no motor whole turns elsewhere.
 
     Args:
         looked: idle recording of the arm.
@@ -199,7 +199,7 @@ def at_rest_check(
 
 
 def rate_check(looked: IdleRecording, lock_step: bool) -> Check:
-    """Check that this machine keeps the rate: median period, and lateness of cycles.
+    """Return the check `rate`: median period, worst lateness and share of late cycles; skipped in virtual time.
 
     Args:
         looked: cycles of the arm, with the work of a run in each.
@@ -226,7 +226,7 @@ def rate_check(looked: IdleRecording, lock_step: bool) -> Check:
 
 
 def loop_rate_check(stamps_ns: Vector, period: float, lock_step: bool, before: Check) -> Check:
-    """Check the rate of the whole loop under holding torque, in addition to the rate measured without torque.
+    """Return the check `rate` with the lateness under torque added; `before` itself if not passed, or in virtual time.
 
     Args:
         stamps_ns: of the cycles [ns], shape (cycles,).
@@ -251,7 +251,7 @@ def loop_rate_check(stamps_ns: Vector, period: float, lock_step: bool, before: C
 def noise_check(
     looked: IdleRecording, described: ArmDescription, model: ArmModel, limits: MotionLimits, mass: Vector
 ) -> Check:
-    """Check the position noise of an arm at rest, and what filter and gains make of it.
+    """Return the check `noise`: position noise at rest, and the velocity and torque that filter and gains make of it.
 
     Args:
         looked: idle recording of the arm at rest.

@@ -120,7 +120,7 @@ def preflight(
     closed: LastPosition | None = None,
     announce: Callable[[str], None] = lambda action: None,
 ) -> Ticket:
-    """Check an arm and a motion.
+    """Check an arm and a motion, with small test motions; return the ticket, whatever its verdict.
 
     Args:
         arm: the arm, not open; it stands on its support, without torque.

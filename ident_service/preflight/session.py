@@ -108,7 +108,7 @@ SHAKEN_REMEDY = (
 
 
 def remedy_of(fault: ArmFault) -> str | None:
-    """Return one sentence that says what to do about a fault.
+    """Return one sentence that says what to do about a fault, by its code; None where the code does not tell.
 
     Args:
         fault: fault that ended the loop.
@@ -120,7 +120,7 @@ def remedy_of(fault: ArmFault) -> str | None:
 
 
 def code_of(fault: ArmFault) -> str:
-    """Return the code of a fault, of repeated warnings that of the warning, with which their sentence begins."""
+    """Return the code of a fault; for `repeated_warnings`, the code of the warning that was repeated."""
     if fault.code == "repeated_warnings":
         return str(fault).removeprefix(f"{fault.code}: ").split(" ", 1)[0]
     return fault.code
@@ -161,7 +161,7 @@ class Trace:
 
 
 def trace_of(rows: Rows, period: float) -> Trace:
-    """Return cycles with their references, the earliest first, as a trace.
+    """Return positions, torques and references of cycles as arrays with even time steps, missing cycles filled in.
 
     Args:
         rows: cycles, at least one, whose stamps rise.
@@ -268,7 +268,7 @@ class Session:
         self._most = (np.abs(to_drives) * self._band).max(axis=1)
 
     def energise(self) -> None:
-        """Enable the arm; the first cycle of `follow` sends the target that holds it.
+        """Enable the drives; ArmFault, torque off again, if the arm moved while a person had to enable it.
 
         Raises:
             ArmFault: a person enabled the arm, and it had been moved meanwhile; it is without torque again.
@@ -286,7 +286,7 @@ class Session:
     def follow(
         self, reference: Reference, seconds: float, learning: float = 0.0, shaking: tuple[Vector, float] | None = None
     ) -> Rows:
-        """Follow a reference for some time.
+        """Control the arm along a reference for some seconds, under the guard; return each cycle's sample and setpoint.
 
         Args:
             reference: trajectory from the present setpoint on.
@@ -340,7 +340,7 @@ class Session:
         return np.array([self._dynamics.torque(position, still, still) for position in positions])
 
     def exchange(self, *, sends: bool = True) -> Sample:
-        """Exchange one cycle with the target that the guard has let pass, or without any; raises DriverError."""
+        """Send the target that the guard has let pass, or none; return the cycle's sample. Raises DriverError."""
         if not sends:
             return self._arm.exchange(None)
         return (self._arm.exchange_position if self.gives_positions else self._arm.exchange)(self._target)
@@ -384,7 +384,7 @@ class Session:
             self._target = self._passed(asked.position) if self.gives_positions else self._limited(wanted)
 
     def repeat_last_torque(self) -> None:
-        """Repeat the target that was sent last, through the guard, while drives report no positions.
+        """Keep the last target, through the guard, as that of the next cycle, while drives report no positions.
 
         Raises:
             ArmFault: the guard found something that is more than a warning.

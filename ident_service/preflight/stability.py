@@ -60,7 +60,7 @@ class Loop:
 
     @property
     def filter_gain(self) -> Vector:
-        """Return the gain of the low-pass, as `ComputedTorque` has it, shape (joints,)."""
+        """Return the low-pass's share of the new velocity in each cycle, 1 - exp(-2 pi cutoff period), (joints,)."""
         gain = 1.0 - np.exp(-2.0 * np.pi * np.asarray(self.cutoff) * self.period)
         return np.asarray(np.broadcast_to(gain, self.kp.shape))
 
@@ -104,11 +104,11 @@ class StabilityReport:
 
     @property
     def stable(self) -> bool:
-        """Return whether `objections` finds nothing."""
+        """Return whether every joint, and all together, are stable and each joint's gain margin is large enough."""
         return not self.objections()
 
     def objections(self) -> list[str]:
-        """Describe in words which joints are unstable or have too small a gain margin."""
+        """Return a sentence for each joint that is unstable or lacks gain margin, and if all together are unstable."""
         found = [
             f"{one.joint}: unstable for some inertia from {one.lightest:g} times the model's up "
             f"(spectral radius {one.radius:.4f}, gain margin {one.gain_margin:.2f})"
@@ -126,14 +126,14 @@ class StabilityReport:
 
 
 def delay_of(config: ArmConfig) -> int:
-    """Return the cycles from a sample to its torque, where the driver states more than the contract's one."""
+    """Return the cycles from a sample to the torque that is computed from it: as the driver states, at least 1."""
     return max(1, config.delay_cycles)
 
 
 def stability(
     model: ArmModel, limits: MotionLimits, delay_cycles: int = 1, postures: Vector | None = None
 ) -> StabilityReport:
-    """Compute the stability of an arm's gains at some postures and over the range of inertias.
+    """Return spectral radius and margins of each joint over a range of inertias, and of all joints at some postures.
 
     Args:
         model: model; without a prior, only each joint by itself is judged.
@@ -173,7 +173,7 @@ def stability(
 
 
 def transition(loop: Loop, ratio: Vector) -> Vector:
-    """Return the matrix of the linear recursion.
+    """Return the matrix of the closed loop's linear recursion from cycle to cycle; its eigenvalues show stability.
 
     Args:
         loop: loop with gains, rate and delay.
@@ -213,7 +213,7 @@ def transition(loop: Loop, ratio: Vector) -> Vector:
 
 
 def spectral_radius(loop: Loop, ratio: Vector) -> Vector:
-    """Return the spectral radius of the recursion, shape (...,), for ratios as `transition` takes them."""
+    """Return the spectral radius of the loop's recursion, (...,), below 1 if stable; `ratio` as in `transition`."""
     return np.asarray(np.abs(np.linalg.eigvals(transition(loop, ratio))).max(axis=-1))
 
 
@@ -267,7 +267,7 @@ def _lightest_and_unknown(model: ArmModel) -> tuple[Vector, Vector]:
 
 
 def drive_matrix(model: ArmModel, delta: Vector) -> Vector:
-    """Return what drives add to the mass matrix, shape (joints, joints)."""
+    """Return the drives' part of the mass matrix by link parameters `delta`, shape (joints, joints)."""
     coupling = model.chain.coupling
     return np.asarray(coupling.T @ (model.layout.term_values("drive_inertia", delta)[:, None] * coupling))
 

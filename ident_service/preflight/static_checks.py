@@ -49,7 +49,7 @@ _POSTURES = 8  # of the motion, at which the coupled loop is judged
 
 @unhurried()
 def configuration_check(model: ArmModel, load: Budget | None = None) -> Check:
-    """Check that the description has all that motion needs: limits, gains, a prior of a real body, room on the bus.
+    """Return the check `configuration`: limits, gains, a prior that a real body has, and room on the bus are there.
 
     Args:
         model: of the arm.
@@ -79,7 +79,7 @@ def configuration_check(model: ArmModel, load: Budget | None = None) -> Check:
 
 
 def long_silence(model: ArmModel, limits: MotionLimits, seconds: float | None) -> str:
-    """Describe in words that joints can fall while drives go on without their host; empty where they do not for long.
+    """Return a sentence if joints can fall and drives act on for too long without their host; else an empty text.
 
     Args:
         model: model of the arm, with a prior.
@@ -97,7 +97,7 @@ def long_silence(model: ArmModel, limits: MotionLimits, seconds: float | None) -
 
 
 def motion_fits_check(model: ArmModel, excitation: Excitation) -> Check:
-    """Check that the motion was made for this description of the arm (`motion_sha256`)."""
+    """Return the check `motion_fits`: passed if the motion was made for this description (`motion_sha256`)."""
     code, remedy = "motion_fits", "Design the motion again for the description as it is now."
     if excitation.arm_sha256 != model.config.motion_sha256:
         return failed(code, f"the {excitation.name} motion was made for another description of the arm", remedy)
@@ -108,7 +108,7 @@ def motion_fits_check(model: ArmModel, excitation: Excitation) -> Check:
 
 @unhurried()
 def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excitation) -> Check:
-    """Check that the motion, the way to it from home, and every stop out of it are proven to keep all limits."""
+    """Return the check `motion_proven`: the motion, the way to it from home and every stop are proven within limits."""
     code, remedy = "motion_proven", "Design the motion again, with larger margins or a smaller share of the limits."
     if model.config.point_speed_limit is not None:
         remedy = f"{remedy} {_SLOWER}"
@@ -142,16 +142,13 @@ def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excit
 
 
 def point_speeds(model: ArmModel, position: Vector, seconds: Vector, what: str) -> list[Measure]:
-    """Compare the fastest of the arm's frames with the speed at which its own safety system stops it.
+    """Return a measure of the fastest frame's speed [m/s], limited as the arm's safety system is; none without such.
 
     Args:
         model: of the arm.
         position: along a motion [rad or m], shape (samples, joints).
         seconds: of the samples [s], shape (samples,).
         what: suffix of the measure's name.
-
-    Returns:
-        One measure; none where no such system is described.
     """
     limit = model.config.point_speed_limit
     if limit is None:
@@ -170,7 +167,7 @@ def _leg_speeds(model: ArmModel, leg: Reference, what: str) -> list[Measure]:
 
 @unhurried()
 def stability_check(model: ArmModel, limits: MotionLimits, excitation: Excitation | None) -> Check:
-    """Check that the gains are stable at this rate and delay, at home, in the middle and along the motion.
+    """Return the check `stability`: the gains are stable at rate and delay, at home, mid-range and along the motion.
 
     Drives that are given positions close the loop by themselves, with gains of their maker's tool.
     """
@@ -202,7 +199,7 @@ def stability_check(model: ArmModel, limits: MotionLimits, excitation: Excitatio
 
 
 def distance_from_home_text(model: ArmModel, limits: MotionLimits, position: Vector) -> str:
-    """Describe how far an arm stands from where motions begin, in words; empty where that is near.
+    """Return in words how far joints stand from home; an empty text if none is farther than `NEAR_HOME`.
 
     Args:
         model: of the arm.
@@ -219,7 +216,7 @@ def distance_from_home_text(model: ArmModel, limits: MotionLimits, position: Vec
 
 
 def path_home_check(model: ArmModel, limits: MotionLimits, position: Vector) -> Check:
-    """Check that the straight way home is clear, from where the arm stands [rad or m], shape (joints,)."""
+    """Return the check `ways_clear`: is the straight way home from `position` [rad or m], (joints,), clear?"""
     code = "ways_clear"
     try:
         ((_, leg),) = PointToPointPlan(Destination.HOME).legs(model, position, limits)
@@ -230,7 +227,7 @@ def path_home_check(model: ArmModel, limits: MotionLimits, position: Vector) -> 
 
 
 def paths_check(model: ArmModel, limits: MotionLimits, excitation: Excitation, position: Vector) -> Check:
-    """Check that the ways from where the arm stands to the motion and back are within limits and clear.
+    """Return the check `ways_clear`: the ways from `position` to the motion and back are within limits and clear.
 
     Args:
         model: of the arm.

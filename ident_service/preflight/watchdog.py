@@ -60,7 +60,7 @@ class Consent:
 
 
 def confirm_watchdog_test(model: ArmModel, sample: Sample, confirm: Confirm) -> Consent:
-    """Ask a person whether the drives' watchdog may be tried, before anything is energised.
+    """Ask a person for the arm's name, to allow the watchdog test; return the consent, or the check that says why not.
 
     Args:
         model: model of the arm, whose name must be typed.
@@ -86,7 +86,7 @@ def confirm_watchdog_test(model: ArmModel, sample: Sample, confirm: Confirm) -> 
 
 
 def watchdogs_of(arm: Arm, model: ArmModel) -> tuple[Watchdog, ...]:
-    """Return the signal that each drive's watchdog watches; where the driver does not say, torque frames, by joint."""
+    """Return each drive's watchdog and the signal that it watches; torque frames, by joint, if none is named."""
     seconds = arm.describe().watchdog
     return arm.watchdogs() or tuple(Watchdog(name, "torque_frames", seconds) for name in model.chain.names)
 
@@ -94,7 +94,7 @@ def watchdogs_of(arm: Arm, model: ArmModel) -> tuple[Watchdog, ...]:
 def watchdog_check(
     arm: Arm, model: ArmModel, session: Session, setpoint_at: Callable[[float], Setpoint], moving: int | None = None
 ) -> Check:
-    """Check that drives stop when the host falls silent while it holds the arm; the arm is without torque afterwards.
+    """Withhold what each watchdog watches; return whether the drives stop in time as a check. The arm is off then.
 
     What one kind of watchdog watches is withheld after the other, and everything else goes on: a drive that stops for
     another reason has not proven its watchdog. So do the closed loop and its guard, for the joints whose drives have

@@ -51,7 +51,7 @@ class KnownArm:
 
 
 def resources(config: ArmConfig) -> tuple[str, ...]:
-    """Return what a motion of this arm must have for itself: the arm, and every bus that it is on."""
+    """Return the names of what a motion of this arm needs for itself: the arm, and each bus that processes share."""
     buses = getattr(config.driver, "buses", ())
     # A bus in lock step is not shared: it is within one process.
     wires = {f"bus {bus.interface} {bus.channel}" for bus in buses if bus.interface != "lock_step"}
@@ -77,7 +77,7 @@ def arm_names(db: Database) -> list[Row]:
 
 
 def known_arm(db: Database, state: Path, name: str) -> KnownArm:
-    """Return the arm of this name.
+    """Return the arm of this name with its description, loaded now; raise UnknownId where there is none.
 
     Raises:
         UnknownId: there is none.
@@ -122,7 +122,7 @@ def add_arm(
     judge: Callable[[Path], object] = lambda _: None,
     draw: Callable[[Path, Path], object] | None = None,
 ) -> KnownArm:
-    """Add an uploaded description; a replaced one of the same name stays on the disk.
+    """Check and store an uploaded description, enter its arm and return it; a replaced one stays on the disk.
 
     Args:
         db: the registry.
@@ -177,7 +177,7 @@ def _description_folder(state: Path, name: str, sha256: str) -> Path:
 
 
 def drawn_meshes(state: Path, config: ArmConfig) -> dict[str, Any]:
-    """Return what can be drawn of an arm by `mesh_file`: `joints` and `notes`, empty where no meshes came with it."""
+    """Return the arm's `joints` that `mesh_file` has triangles of, and `notes`; both empty without meshes."""
     try:
         text = (_description_folder(state, config.name, config.sha256) / _DRAWN / DRAWN_LIST).read_text("utf-8")
     except FileNotFoundError:
@@ -215,7 +215,7 @@ def _require_free(db: Database, config: ArmConfig, *, replace: bool) -> None:
 
 
 def uploaded_description(state: Path, name: str) -> Path | None:
-    """Return the description of an arm that was uploaded to the daemon of a state folder; None where there is none."""
+    """Return the file of the description of an arm that was uploaded to a state folder; None where there is none."""
     if not _NAME.fullmatch(name) or not (state / FILE).is_file():
         return None
     with Database(state) as db:
@@ -225,7 +225,7 @@ def uploaded_description(state: Path, name: str) -> Path | None:
 
 @contextmanager
 def uploaded(state: Path, text: str, files: Mapping[str, str]) -> Iterator[Path]:
-    """Yield the file of an uploaded description, beside the files that it names, for the duration of the block.
+    """Write an uploaded description and its files into a temporary folder and yield its path during the block.
 
     Args:
         state: the state folder.

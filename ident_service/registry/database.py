@@ -270,7 +270,7 @@ _WANTED = 2**16  # bytes; SQLite's shared index of its log takes half of them, a
 
 
 def registry_error(path: Path, error: Exception) -> IdentError:
-    """Return what an error of SQLite, or of the registry's disk, means to whoever asked.
+    """Return, without raising it, the error that tells a user of one of SQLite: busy, disk full, damaged or not usable.
 
     Args:
         path: the registry's file.
@@ -285,7 +285,7 @@ def registry_error(path: Path, error: Exception) -> IdentError:
 
 
 def shortage(path: Path, error: BaseException) -> RegistryBusy | DiskFull | None:
-    """Return what is short for a while where an error says so; None where it says something else.
+    """Return, without raising it, RegistryBusy or DiskFull where an error says so; None for any other error.
 
     Args:
         path: the registry's file.
@@ -419,7 +419,7 @@ class Database:
         return next(iter(self.rows(sql, *values)), None)
 
     def known(self, table: str, what: str, name: str, column: str = "id") -> Row:
-        """Return the row of this id, or of another unique column.
+        """Return the row of this id, or of another unique column; raise UnknownId where there is none.
 
         Raises:
             UnknownId: there is none.
@@ -530,7 +530,7 @@ def note(db: Database, who: str, what: str, about: str, **detail: Any) -> None:
 
 
 def note_later(state: Path, who: str, what: str, about: str, **detail: Any) -> None:
-    """Leave one line, with the time of now, for whoever can write the registry next; as `note`.
+    """Store an audit line, with the present time, in a file, from where it is entered later; as `note`.
 
     Args:
         state: the state folder.
@@ -549,7 +549,7 @@ def note_later(state: Path, who: str, what: str, about: str, **detail: Any) -> N
 
 
 def write_deferred_entries(db: Database, state: Path) -> None:
-    """Enter the lines that `note_later` has left; each once, whoever is killed meanwhile."""
+    """Enter the lines that `note_later` has stored in files, each once, and delete the files."""
     place = state / _WAITING
     for path in sorted(place.glob("*.json")) if place.is_dir() else ():
         try:
@@ -576,7 +576,7 @@ class AuditQueue:
         self._thread.start()
 
     def note(self, who: str, what: str, about: str, **detail: Any) -> None:
-        """Queue one line with the present time; never waits."""
+        """Queue one line with the present time; never waits. It is lost, with an error logged, if too many wait."""
         line = _line(who, what, about, detail)
         with self._changed:
             if len(self._lines) < _MOST_WAITING:
@@ -641,6 +641,6 @@ def audit_entries_after(db: Database, line: int, most: int = 500) -> list[Row]:
 
 
 def last_line(db: Database) -> int:
-    """Return the id of the newest line; 0 where there is none."""
+    """Return the id of the newest line of the audit trail; 0 where there is none."""
     row = db.row("SELECT MAX(id) AS id FROM audit")
     return int(row["id"] or 0) if row is not None else 0

@@ -39,7 +39,7 @@ def add_job(
     motion: bool,
     run: str | None,
 ) -> Row:
-    """Enter a queued job."""
+    """Enter a queued job; return its row."""
     db.write(
         "INSERT INTO jobs (id, kind, arm, state, motion, request, words, run, created, created_by) "
         "VALUES (?, ?, ?, 'queued', ?, ?, ?, ?, ?, ?)",
@@ -49,7 +49,7 @@ def add_job(
 
 
 def known_job(db: Database, job: str) -> Row:
-    """Return the job of this id.
+    """Return the row of the job of this id; raise UnknownId where there is none.
 
     Raises:
         UnknownId: there is none.
@@ -102,7 +102,7 @@ def ended(db: Database, job: str, state: str, detail: str, exit_code: int | None
 
 
 def made_nothing(db: Database, job: str) -> None:
-    """Forget the id of what a job was to make, and has not made: it leads nowhere."""
+    """Clear the id of the folder that a job was to make, and has not made: it leads nowhere."""
     db.write("UPDATE jobs SET run = NULL WHERE id = ?", job)
 
 
@@ -146,7 +146,7 @@ def job_of_key(db: Database, who: str, key: str, request: str) -> Row | None:
 
 
 def typical_seconds(db: Database, kind: str, arm: str | None) -> float | None:
-    """Return the median duration of the last completed jobs of a kind [s]; None before there was one."""
+    """Return the median duration of the last nine completed jobs of a kind and arm [s]; None before any."""
     rows = db.rows(
         "SELECT ended - started AS seconds FROM jobs WHERE kind = ? AND arm IS ? AND state IN ('done', 'refused') "
         "AND started IS NOT NULL ORDER BY number DESC LIMIT 9",

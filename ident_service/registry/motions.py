@@ -24,7 +24,7 @@ def new_id(arm: str) -> str:
 
 
 def index_motion(db: Database, state: Path, motion: str, arm: str, by: str) -> None:
-    """Enter the motion that is in its folder in the registry.
+    """Enter a motion, whose file is in its folder, in the registry, if it is not there yet.
 
     Raises:
         UsageError: it is not one.
@@ -64,7 +64,7 @@ def add_motion(db: Database, state: Path, arm: str, text: str, by: str, joints: 
 
 
 def known_motion(db: Database, motion: str) -> Row:
-    """Return the motion of this id.
+    """Return the row of the motion of this id; raise UnknownId where there is none.
 
     Raises:
         UnknownId: there is none.
@@ -73,10 +73,10 @@ def known_motion(db: Database, motion: str) -> Row:
 
 
 def motions(db: Database, arm: str | None = None, *, before: str | None = None, most: int = 500) -> list[Row]:
-    """Return motions, or those of an arm, the newest first, from the one after the id `before`; as `known_motion`."""
+    """Return motions, or those of an arm, the newest first, from the one after the id `before`."""
     return db.newest("motions", "motion", "added", arm, before, most)
 
 
 def motion_path(db: Database, state: Path, motion: str) -> Path:
-    """Return the file of a motion, from the id in the registry, never from a word of the request."""
+    """Return the path of a motion's file, by the id in the registry, never by a word of the request; or UnknownId."""
     return state / MOTIONS / str(known_motion(db, motion)["id"]) / MOTION_FILE

@@ -34,7 +34,7 @@ _RECORDING = ".mcap"
 
 
 def index_run(db: Database, state: Path, run: str) -> Row:
-    """Enter a run's folder in the registry, or enter it again.
+    """Verify a run's folder and enter it, its recordings and parameters in the registry, also again; return the row.
 
     Raises:
         UsageError: no such folder, or no arm in it.
@@ -99,7 +99,7 @@ def rebuild_runs(db: Database, state: Path) -> list[str]:
 
 
 def known_run(db: Database, run: str) -> Row:
-    """Return the run of this id.
+    """Return the row of the run of this id; raise UnknownId where there is none.
 
     Raises:
         UnknownId: there is none.
@@ -108,12 +108,12 @@ def known_run(db: Database, run: str) -> Row:
 
 
 def runs(db: Database, arm: str | None = None, *, before: str | None = None, most: int = 100) -> list[Row]:
-    """Return runs, or those of an arm, the newest first, from the one after the id `before`; raises as `known_run`."""
+    """Return runs, or those of an arm, the newest first, from the one after the id `before`."""
     return db.newest("runs", "run", "created", arm, before, most)
 
 
 def recordings(db: Database, run: str) -> list[Row]:
-    """Return the recordings of a run."""
+    """Return name, hash, size and time of deletion, None if kept, of each recording of a run, by name."""
     return db.rows("SELECT name, sha256, bytes, deleted FROM recordings WHERE run = ? ORDER BY name", run)
 
 
@@ -142,7 +142,7 @@ def recording_name(db: Database, run: str) -> str:
 
 
 def parameter_set(db: Database, run: str) -> Row | None:
-    """Return the entry of the parameters that a run holds; None where it holds none."""
+    """Return the registry's row on the parameters that a run holds; None where it holds none."""
     return db.row("SELECT * FROM parameter_sets WHERE run = ?", run)
 
 
@@ -192,13 +192,13 @@ def run_labels(db: Database, run: str | None = None) -> dict[str, Row]:
 
 
 def shown_labels(found: Mapping[str, Row], run: str) -> dict[str, Any]:
-    """Return `tags` and `note` of a run from what `run_labels` found; none where nobody gave it any."""
+    """Return `tags` and `note` of a run from what `run_labels` found; empty ones where nobody gave it any."""
     row = found.get(run, {"tags": [], "note": ""})
     return {"tags": row["tags"], "note": row["note"]}
 
 
 def run_folder(db: Database, state: Path, run: str) -> Path:
-    """Return the folder of a run, from the id in the registry, never from a word of the request."""
+    """Return the path of a run's folder, by the id in the registry, never by a word of the request; or UnknownId."""
     return state / RUNS / str(known_run(db, run)["id"])
 
 
@@ -211,7 +211,7 @@ def run_files(db: Database, state: Path, run: str) -> dict[str, str]:
 
 
 def run_file(db: Database, state: Path, run: str, name: str) -> Path:
-    """Return the path of a file that the manifest of a run names.
+    """Return the path of a file that the manifest of a run names; raise UnknownId for any other name.
 
     Raises:
         UnknownId: no such run, or no such file in it.
@@ -285,7 +285,7 @@ _ENDED = ("done", "refused")  # a payload job that found no load has files, too
 
 
 def known_export(db: Database, export: str) -> Row:
-    """Return the job that made the export of this id.
+    """Return the row of the job that made the export of this id; raise UnknownId where there is none.
 
     Raises:
         UnknownId: there is none, or it made nothing.
@@ -313,7 +313,7 @@ def export_files(db: Database, state: Path, export: str) -> dict[str, int]:
 
 
 def export_file(db: Database, state: Path, export: str, name: str) -> Path:
-    """Return the path of one file of an export.
+    """Return the path of one file of an export; raise UnknownId where there is no such file.
 
     Raises:
         UnknownId: no such export, or no such file in it.

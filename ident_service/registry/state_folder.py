@@ -28,7 +28,7 @@ _OTHERS_ENTER = 0o011
 
 
 def require_private(state: Path) -> None:
-    """Check that nobody else can enter a state folder, and let only its owner read files written from now on.
+    """Raise UsageError if others can enter a state folder; set the umask so that only the owner reads new files.
 
     Args:
         state: the folder, there or not yet.
@@ -48,7 +48,7 @@ def require_private(state: Path) -> None:
 
 
 def access_refusal(state: Path, *, writing: bool = False) -> str | None:
-    """Say why a state folder is not for this process's user, with the remedy; None where it is, or is not there yet.
+    """Return why this process's user must not use a state folder, with the remedy; None if they may, or it is new.
 
     Args:
         state: the folder.
@@ -71,7 +71,7 @@ def access_refusal(state: Path, *, writing: bool = False) -> str | None:
 
 
 def give_to_owner(state: Path, path: Path) -> None:
-    """Give what root has made in somebody else's state folder to its owner; for acts that are refused to nobody.
+    """Give what root has made in another user's state folder to that user; do nothing unless called by root.
 
     Args:
         state: the state folder.
@@ -101,7 +101,7 @@ def _sudo_user(number: int) -> str:
 
 
 def require_no_interrupted_restore(state: Path) -> None:
-    """Refuse a state folder in which a restore was interrupted.
+    """Raise UsageError for a state folder in which a restore was interrupted.
 
     Raises:
         UsageError: a restore was interrupted.
@@ -112,7 +112,7 @@ def require_no_interrupted_restore(state: Path) -> None:
 
 @contextmanager
 def single_instance(state: Path) -> Iterator[None]:
-    """Hold the state folder's lock during the block; it vanishes with this process, however that ends.
+    """Hold the state folder's lock during the block; raise UsageError at once if another process holds it.
 
     Raises:
         UsageError: another process holds it, or it cannot be made.
@@ -167,7 +167,7 @@ def fault_file(state: Path, arm: str) -> FaultStore:
 
 
 def new_run_folder(state: Path, arm: str, kind: str = "runs") -> Path:
-    """Return a new folder name under the state folder that no earlier run, or other thing of `kind`, has."""
+    """Return a path under the state folder for a new run, or thing of `kind`; nothing is there, nothing is made."""
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
     folder, count = state / kind / f"{stamp}-{arm}", 1
     while folder.exists():

@@ -80,7 +80,7 @@ def digests(db: Database) -> dict[str, Access]:
 
 
 def access(db: Database, secret: str) -> Access | None:
-    """Return whose token this is; None if nobody's."""
+    """Return name and role of a token; None if it is unknown or revoked."""
     return digests(db).get(digest(secret))
 
 
@@ -113,12 +113,12 @@ def sessions(db: Database) -> dict[str, tuple[str, float]]:
 
 
 def digest(secret: str) -> str:
-    """Return the SHA-256 that is stored of a token."""
+    """Return the SHA-256, in hexadecimal digits, that is stored in place of a token."""
     return hashlib.sha256(secret.encode("utf-8", "surrogatepass")).hexdigest()
 
 
 def first_token(db: Database, state: Path) -> Path:
-    """Make sure that the owner of the state folder has a token, in a file that only they can read.
+    """Make an operator token for the folder's owner unless the token file has a valid one; return the file's path.
 
     A file that is gone, or whose token was revoked or stems from another registry, is made anew.
 
@@ -151,7 +151,7 @@ def first_token(db: Database, state: Path) -> Path:
 
 
 def revoke_first_tokens(db: Database, by: str) -> None:
-    """Let no token count any more that `first_token` made, for a registry that comes into another place or time."""
+    """Revoke all tokens that `first_token` made, for a registry that comes into another place or time."""
     for row in db.rows(
         "SELECT name FROM tokens WHERE revoked IS NULL AND name IN "
         "(SELECT about FROM audit WHERE who = 'service' AND what = 'token added')"
@@ -160,7 +160,7 @@ def revoke_first_tokens(db: Database, by: str) -> None:
 
 
 def read_token(path: Path) -> str | None:
-    """Return the token in a file; None without one.
+    """Return the token in a file, None without one; raise UsageError if others than its owner can read it.
 
     Raises:
         UsageError: others than its owner can read it, or it cannot be read.

@@ -54,17 +54,17 @@ class JointAssessment:
 
     @property
     def whole(self) -> float:
-        """Return the error over all rows that decides: of unseen motion, else of the fitted one [percent]."""
+        """Return the torque error over all rows [percent]: the largest on unseen data, else that on the fitted data."""
         return self.unseen if self.unseen is not None else self.fitted or 0.0
 
     @property
     def moving(self) -> float | None:
-        """Return the same without rows near standstill; None where the file does not have it."""
+        """Return the torque error without rows near standstill [percent], unseen or else fitted; None if not known."""
         return self.unseen_moving if self.unseen is not None else self.fitted_moving
 
     @property
     def in_motion(self) -> bool:
-        """Return whether the joint's torque is predicted poorly in motion, too."""
+        """Return whether the torque error away from standstill is above `POOR` percent, or not known."""
         return self.moving is None or self.moving > POOR
 
 
@@ -98,7 +98,7 @@ class Assessment:
 
 
 def assess(content: Mapping[str, Any]) -> Assessment:
-    """Assess a parameter file.
+    """Assess a parameter file: verdict `use`, `use with care` or `do not use`, its reasons, errors of each joint.
 
     Args:
         content: of `parameters.json`; a table of values alone can be assessed, too.
@@ -188,7 +188,7 @@ def error_document(estimate: Estimate) -> dict[str, Any]:
 
 
 def joint_assessments(content: Mapping[str, Any]) -> tuple[JointAssessment, ...]:
-    """Return a row per joint, the largest error first; none where the file has no errors."""
+    """Return the torque errors of each joint, fitted and unseen, the largest first; none where the file has none."""
     if "fit" not in content:
         return ()
     fitted, unseen = content["fit"]["per_joint"], [one["per_joint"] for one in content.get("validation", [])]
@@ -227,7 +227,7 @@ def poor_joints(content: Mapping[str, Any]) -> list[JointAssessment]:
 
 
 def generalises_poorly(content: Mapping[str, Any]) -> bool:
-    """Return whether unseen motions are predicted markedly worse than the fitted ones; without standstill, if known."""
+    """Return whether the worst unseen error is large, and much larger than the fitted one; in motion, if known."""
     fit, unseen = content.get("fit"), content.get("validation", [])
     if fit is None or not unseen:
         return False
@@ -239,13 +239,13 @@ def generalises_poorly(content: Mapping[str, Any]) -> bool:
 
 
 def active_constraints(content: Mapping[str, Any]) -> list[str]:
-    """Return the names of the active constraints; none where no body has the parameters."""
+    """Return the names of the active constraints; empty where no body can have the parameters."""
     found = content.get("feasibility", {})
     return list(found.get("tight", [])) if found.get("margin", 0.0) > 0.0 else []
 
 
 def joints_in_words(joints: Sequence[JointAssessment]) -> str:
-    """List every joint with its errors, in words."""
+    """Format each joint with its torque error in percent, and that away from standstill where it is small there."""
     return ", ".join(
         f"{one.joint} ({_percent(one.whole)}"
         + (")" if one.in_motion or one.moving is None else f"; {_percent(one.moving)} away from standstill)")

@@ -16,7 +16,7 @@ from ident_service.results.run_folder import ARM, MANIFEST, PARAMETERS
 
 
 def dynamic_model(path: Path, arm: str | Path | None) -> DynamicModel:
-    """Load the dynamic model of identified parameters; see `ident_service.results.load_model`."""
+    """Return the dynamic model of identified parameters, friction included; ModelError where they are not feasible."""
     found = _identified(path, arm)
     if found.delta is None:
         raise ModelError(

@@ -29,7 +29,7 @@ _EXCHANGE = 2  # RENAME_EXCHANGE
 
 
 def require_place(folder: Path) -> None:
-    """Refuse a folder that could not be written, before work is done for it.
+    """Raise UsageError if a folder is a file or could not be written, before work is done for it; makes nothing.
 
     Raises:
         UsageError: it is a file, or lies where nothing can be written.
@@ -44,7 +44,7 @@ def require_place(folder: Path) -> None:
 
 
 def require_folder_of(file: Path) -> None:
-    """Refuse a file whose folder is not there, before work is done for it.
+    """Raise UsageError if the folder that a file is to be written into is not there, before work is done for it.
 
     Raises:
         UsageError: there is no such folder.
@@ -155,7 +155,7 @@ def named_files(folder: Path) -> Mapping[str, str]:
 
 
 def verified_files(folder: Path, *, but: frozenset[str] = frozenset()) -> Mapping[str, str]:
-    """Return name to SHA-256, each verified on a regular file, not on a link.
+    """Return name to SHA-256 of a manifest's files; raise unless each is a regular file with that hash.
 
     Args:
         folder: folder to be read.
@@ -207,7 +207,7 @@ _NAMED = 3
 
 
 def require_replaceable(folder: Path) -> None:
-    """Refuse a folder that results may not be written to.
+    """Raise UsageError if a folder cannot be written or holds anything but an earlier result; absent is fine.
 
     Raises:
         UsageError: it is a file, lies where nothing can be written, or holds what is no earlier result; with what it

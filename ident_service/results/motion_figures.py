@@ -104,9 +104,9 @@ class MotionTraces:
         return np.where(sign * limit >= LARGEST, np.inf, sign * limit)
 
     def shares(self, quantity: str) -> Array:
-        """Return the largest share of the way from the middle to a limit, shape (joints,).
+        """Return each joint's largest distance from mid-range over half the range, (joints,), so that 1 is at a limit.
 
-        1 is at a limit. NaN where a joint has no limits on both sides, or the quantity is not given.
+        NaN where a joint has no limits on both sides, or the quantity is not given.
         """
         values = getattr(self, quantity)
         low, high = self.limits(quantity)
@@ -118,7 +118,7 @@ class MotionTraces:
 
 
 def joints_over_time(traces: MotionTraces, title: str = "Motion of the joints") -> str:
-    """Draw position, velocity, acceleration and torque over time as far as given, one row per joint.
+    """Draw position, velocity, acceleration and torque over time as far as given, a row per joint; return the SVG.
 
     Args:
         traces: the motion and its limits.

@@ -42,7 +42,7 @@ from ident_service.results.summary import how_fitted, implausible_links, torque_
 
 
 def strict_json(text: str) -> Any:
-    """Parse a JSON text strictly.
+    """Parse a JSON text; raise ValueError for NaN, Infinity and numbers too large for a double.
 
     Raises:
         ValueError: not JSON, or a number that is none.
@@ -73,7 +73,7 @@ _VALUES, _ENTRIES, _KEYS, _CHARACTERS = 20_000, 200, 1000, 1000
 
 
 def require_schema(content: Any, name: str, where: object, what: str) -> None:
-    """Validate a document against `NAME.schema.json`.
+    """Raise ParameterError unless a document fits the schema `NAME.schema.json`.
 
     Args:
         content: JSON values.
@@ -181,7 +181,7 @@ class ParameterFile:
 def read_parameters(
     path: Path, names: tuple[str, ...] | None = None, notation: Notation | None = None
 ) -> ParameterFile:
-    """Read a parameter file.
+    """Read a parameter file; check its schema, and that its expressions are independent and name link parameters.
 
     Args:
         path: the file, or the folder of results that holds it.
@@ -450,7 +450,7 @@ _LARGEST = 1e30  # largest value in SI units; far beyond every arm, and its squa
 
 
 def require_consistent(file: ParameterFile, where: Path) -> None:
-    """Check that the values of a parameter file belong together.
+    """Raise ParameterError unless the values of a parameter file agree with each other and are of possible size.
 
     Args:
         file: parameter file that was read.
@@ -490,7 +490,7 @@ def named_link_values(file: ParameterFile) -> dict[str, float] | None:
 
 
 def require_base_values(base: BaseParameters, delta: Array, values: Array, where: Path) -> None:
-    """Check that link values have the base values.
+    """Raise ParameterError unless the link values have the base values.
 
     Args:
         base: the grouping.

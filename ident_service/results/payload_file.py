@@ -179,7 +179,7 @@ def payload_text(payload: Payload, arm: KnownArm) -> str:
 
 
 def rounded(values: Array) -> Array:
-    """Return the ten parameters of a body with zeros for mere rounding, per kind of quantity."""
+    """Return the ten parameters of a body, those that are mere rounding beside others of their quantity as zero."""
     shown = np.array(values, dtype=float)
     for quantity in (slice(0, 6), slice(6, 9), slice(9, 10)):
         part = shown[quantity]
@@ -188,7 +188,7 @@ def rounded(values: Array) -> Array:
 
 
 def loaded_config(config: ArmConfig) -> ArmConfig:
-    """Return the arm's configuration with a load, without bounds that hold only for the arm without it."""
+    """Return the arm's description without the bounds on its last link and total mass, which the load changes."""
     joints = dict(config.joints)
     if joints:
         last = list(joints)[-1]
@@ -204,7 +204,7 @@ def loaded_parameters(
     recorded: Equations,
     recordings: Sequence[Mapping[str, str]],
 ) -> tuple[dict[str, Any], Array | None]:
-    """Return the content of `parameters.json` of the arm with its payload, or without what was taken off.
+    """Return (content of `parameters.json` of the arm with its payload, link parameters (layout.size,) or None).
 
     Args:
         content: content of the arm's parameter file.

@@ -177,7 +177,7 @@ def _pixel(value: float) -> str:
 
 
 def points_of(x: Array, y: Array) -> str:
-    """Return the coordinates of a polyline or polygon [px], to a tenth of a pixel below 1000."""
+    """Format the coordinates [px] of a polyline or polygon for SVG, to a tenth of a pixel below 1000."""
     # One call for all: thousands of points are a third of the time that a report takes.
     return ("%.4g,%.4g " * len(x) % tuple(np.column_stack([x, y]).ravel().tolist())).rstrip()
 
@@ -238,7 +238,7 @@ class Canvas:
         self._parts.append(f'<text class="{kind}" {where}>{title}{plain(words)}</text>')
 
     def clip(self, axes: Axes | None) -> None:
-        """Clip what follows to axes, until it is called with None."""
+        """Clip what is drawn from now on to the rectangle of some axes; None ends that."""
         if axes is None:
             self._parts.append("</svg>")
             return
@@ -248,7 +248,7 @@ class Canvas:
         self._parts.append(f"<svg {where}>")
 
     def svg(self, title: str, description: str, *, inline: bool = False) -> str:
-        """Return the whole drawing.
+        """Return the whole drawing as SVG text.
 
         Args:
             title: title, which a screen reader says first.
@@ -280,11 +280,11 @@ class Axes:
     high_y: float
 
     def x(self, value: Array | float) -> Array:
-        """Return pixels from the left."""
+        """Convert values of the quantity that lies across to pixels from the left edge of the drawing."""
         return np.asarray(self.left + self.width * (np.asarray(value) - self.low_x) / (self.high_x - self.low_x))
 
     def y(self, value: Array | float) -> Array:
-        """Return pixels from the top."""
+        """Convert values of the upright quantity to pixels from the top edge of the drawing."""
         return np.asarray(self.top + self.height * (self.high_y - np.asarray(value)) / (self.high_y - self.low_y))
 
 
@@ -297,7 +297,7 @@ def round_values(low: float, high: float, most: int) -> list[float]:
 
 
 def visible(time: Array, values: Array, columns: int) -> NDArray[np.intp]:
-    """Return the samples that a line needs so that it looks like the line through all of them.
+    """Return the indices of the samples that a line needs so that it looks like the line through all of them.
 
     Args:
         time: increasing, shape (samples,).
@@ -318,7 +318,7 @@ def visible(time: Array, values: Array, columns: int) -> NDArray[np.intp]:
 
 
 def require_drawable(name: str, values: Array, shape: tuple[int, ...], *, unlimited: bool = False) -> None:
-    """Refuse values that cannot be drawn.
+    """Raise UsageError for values that cannot be drawn: empty, of another shape, NaN, infinite or huge.
 
     Args:
         name: name of the values, for the message.
@@ -345,7 +345,7 @@ _FEWEST, _MOST = 3, 6  # round numbers along an axis
 
 
 def range_around(*values: Array, least: float = 0.0, zero: bool = False, share: float = 0.06) -> tuple[float, float]:
-    """Return a range that holds all finite values with room for the lines' own width.
+    """Return (low, high) of a range that holds all finite values, with room for the lines' own width.
 
     Args:
         values: values, of any shapes.

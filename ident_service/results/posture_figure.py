@@ -222,7 +222,7 @@ _PAGE, _NARROW = _Format(520.0, 560.0, 240.0, 100.0), _Format(220.0, 260.0, 160.
 
 
 def stick_figure(postures: Postures, title: str = "The arm along its motion") -> str:
-    """Draw side view (x-z) and top view (x-y) of an arm along its motion.
+    """Draw side view (x-z) and top view (x-y) of an arm along its motion; return the SVG.
 
     Postures fade in from early to late; the tool's path is a thin line through all of them. The posture of smallest
     clearance stands out with the names of the pair and their distance. Half-spaces are drawn where they meet the
@@ -276,7 +276,7 @@ def _views(postures: Postures, shown: Sequence[int], form: _Format) -> Canvas:
 def spike_figure(
     mechanism: Chain, joint: int, time: float, residual: float, position: Array, *, inline: bool = False
 ) -> str:
-    """Draw the posture in which a joint has its largest residual, with the joint marked, from the side and from above.
+    """Draw the posture with a joint's largest residual, the joint marked, from two sides; return the SVG.
 
     Args:
         mechanism: of the arm.
@@ -318,7 +318,7 @@ _PICTURE_WIDTH, _PICTURE_HEIGHT, _PICTURE_MARGIN = 280.0, 210.0, 12.0
 
 
 def silhouette(limbs: Sequence[Limb], title: str) -> str:
-    """Draw an arm in one posture, from the side and somewhat above, as a small picture without scales.
+    """Draw an arm in one posture, from the side and above, as a small picture without scales; return the SVG.
 
     Args:
         limbs: parts of the arm, one at least.

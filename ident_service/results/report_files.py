@@ -43,7 +43,7 @@ def write_report(
     validation: Sequence[Recording],
     warnings: Sequence[str],
 ) -> list[str]:
-    """Write evidence and report into a folder that has the other files of the estimate, before its manifest.
+    """Write evidence and report into a folder with the estimate's other files, before its manifest; return names.
 
     Args:
         folder: folder that `write_results` has written.
@@ -51,9 +51,6 @@ def write_report(
         recordings: recordings that were fitted to.
         validation: recordings that were not fitted to.
         warnings: what is wrong with the recordings, in words.
-
-    Returns:
-        The names of the files.
 
     Raises:
         RecordingError: a recording can no longer be read.
@@ -69,7 +66,7 @@ def write_report(
 
 
 def read_reported(folder: Path) -> Results:
-    """Read a folder that a report can be made of.
+    """Read and verify a folder of results; UsageError if it holds a payload, of which no report can be made.
 
     Raises:
         UsageError: it holds a payload, which has no report.
@@ -82,7 +79,7 @@ def read_reported(folder: Path) -> Results:
 
 
 def read_evidence_of(results: Results) -> Evidence:
-    """Read the evidence of a folder whose other results have been read.
+    """Read the evidence of a folder of results, and check that it belongs to the parameter file there.
 
     Raises:
         UsageError: there is none.
@@ -102,14 +99,11 @@ def read_evidence_of(results: Results) -> Evidence:
 
 
 def make_report(folder: Path, out: Path | None = None) -> tuple[Path, Assessment]:
-    """Make the report of a folder of results again.
+    """Write the report of a folder of results again; return (its page, the assessment on top of it).
 
     Args:
         folder: folder made by `ident identify` or `ident simulate`.
         out: path of the page; in the folder, whose manifest then names it, when None.
-
-    Returns:
-        The page, and the assessment on top of it.
 
     Raises:
         UsageError, ParameterError, ConfigError: the folder is not what its manifest names, or has no evidence.
@@ -139,7 +133,7 @@ _FONTS = ("DejaVu Sans", "Liberation Sans", "Noto Sans", "Arial", "Helvetica")
 
 
 def write_figures(run: Path, out: Path, form: Literal["svg", "png"]) -> list[str]:
-    """Write every drawing of a report.
+    """Write every drawing of a report as SVG or PNG files into a folder; return their names.
 
     Args:
         run: folder of results with evidence.

@@ -50,7 +50,7 @@ class Results:
 
 
 def read_results(folder: Path) -> Results:
-    """Read a folder of results that `write_results` and `write_manifest` wrote, here or on another machine.
+    """Read a folder of results, each file verified by its manifest; raise unless arm and parameters fit together.
 
     Raises:
         UsageError: no such folder, or nothing was identified in it.
@@ -77,7 +77,7 @@ def write_results(
     described: ArmConfig | None = None,
     torque: str = "commanded",
 ) -> list[str]:
-    """Write an estimate's files into an existing folder, with the program that checks its certificate.
+    """Write an estimate's files, and the program that checks its certificate, into a folder; return their names.
 
     Args:
         folder: folder to write.

@@ -91,7 +91,7 @@ def noise_and_model(noise: Array | None, variances: Array) -> str:
 
 
 def wrapped(sentences: Iterable[str]) -> list[str]:
-    """Wrap sentences into lines for a terminal."""
+    """Wrap sentences into lines of at most 100 characters, those that go on indented."""
     return [line for sentence in sentences for line in textwrap.wrap(sentence, 100, subsequent_indent="  ")]
 
 
@@ -266,7 +266,7 @@ def _preliminary_findings(estimate: Estimate) -> list[str]:
 
 
 def torque_constants_document(estimate: Estimate) -> dict[str, Any]:
-    """Return the torque constants of the motors as JSON values, where they were identified."""
+    """Return the identified torque constants of the motors as JSON values; an empty dict if they were not."""
     found = estimate.prepared.torque_constants
     if found is None:
         return {}

@@ -41,11 +41,11 @@ class JobProcess(Protocol):
 
     @property
     def exit_code(self) -> int | None:
-        """Return the exit code that the parent sees; None where the service is not the parent."""
+        """Return the exit code; None while the process runs, and where the service is not its parent."""
 
     @property
     def process(self) -> str:
-        """Return the name by which `alive` finds the process again."""
+        """Return the name (number, start time, boot id) by which `alive` finds the process again."""
 
     def close(self) -> None:
         """End the process's standard input."""
@@ -100,7 +100,7 @@ class SubprocessJob:
 
     @property
     def process(self) -> str:
-        """Return the name by which `alive` finds the subprocess again."""
+        """Return the name (number, start time, boot id) by which `alive` finds the subprocess again."""
         return self._name
 
     def close(self) -> None:
@@ -162,7 +162,7 @@ class UnitChild:
 
     @property
     def process(self) -> str:
-        """Return the name by which `alive` finds the process again; empty before it has written it."""
+        """Return the name by which `alive` finds the process again, from its file; empty before it has written that."""
         with suppress(OSError):
             return (self._folder / PROCESS).read_text(encoding="ascii").strip()
         return ""
@@ -177,7 +177,7 @@ class UnitChild:
 
 
 def name_of(pid: int) -> str:
-    """Return a name for a process that is unique on this machine: its number, start time and the boot id."""
+    """Return `NUMBER START BOOT`, a name that no other process of this machine ever has; empty if there is none."""
     try:
         began = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()[19]
         boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
@@ -187,7 +187,7 @@ def name_of(pid: int) -> str:
 
 
 def alive(process: str) -> bool:
-    """Return whether the process of this name exists and is no zombie."""
+    """Return whether the process with this name (`name_of`) exists and is no zombie."""
     if not process or name_of(pid := int(process.split()[0])) != process:
         return False
     try:

@@ -88,7 +88,7 @@ class Command:
 
 
 def command(db: Database, state: Path, request: asked.AnyJobRequest) -> Command:
-    """Return the command that carries out a request.
+    """Make the command that carries out a request: its arguments, arm, folder to make, and resources that it needs.
 
     Raises:
         UsageError: it names what is not known.
@@ -118,7 +118,7 @@ def command(db: Database, state: Path, request: asked.AnyJobRequest) -> Command:
 
 
 def accepted_description(state: Path, arm: str, number: int) -> Path:
-    """Return the file of the description that an acceptance keeps.
+    """Return the file of the arm description that an acceptance keeps, checked; raise UsageError if it names code.
 
     Raises:
         UsageError: there is no such acceptance; or its description names code, which only a terminal may run. An upload
@@ -250,7 +250,7 @@ def _columns(db: Database, state: Path, references: Sequence[asked.RecordingRefe
 
 
 def range_words(one: asked.RecordingReference) -> str:
-    """Format a recording's range as the command line has it; empty for a whole recording."""
+    """Format a recording's range as `@START:END` [s], an open side empty; an empty text for a whole recording."""
     if one.start is None and one.end is None:
         return ""
     return "@" + ":".join("" if seconds is None else f"{seconds:.9f}" for seconds in (one.start, one.end))

@@ -69,7 +69,7 @@ class ProcessOutput:
 
 
 def process_output(folder: Path, most: int = _LAST) -> ProcessOutput:
-    """Read the answer and the last `most` bytes of the log of a job's process."""
+    """Read the JSON answer of a job's process and the last `most` bytes of its log; empty where there is none."""
     answer: dict[str, Any] = {}
     try:
         with (folder / ANSWER).open("rb") as stream:
@@ -106,7 +106,7 @@ def printed_samples(folder: Path, offset: int) -> tuple[list[dict[str, Any]], in
 
 
 def outcome(output: ProcessOutput, exit_code: int | None, end_reason: str) -> Outcome:
-    """Return the outcome of a process that has ended.
+    """Decide an ended job's state, detail and exit code by its answer's exit code, or by `exit_code` without an answer.
 
     Args:
         output: of the process.
@@ -131,7 +131,7 @@ def outcome(output: ProcessOutput, exit_code: int | None, end_reason: str) -> Ou
 
 
 def interrupted(output: ProcessOutput, folder: Path | None, *, moves: bool) -> str:
-    """Describe a job that was running when the service died, from its output and its folder.
+    """Return words on a job that was running when the service died: how its motion and process ended, what was kept.
 
     Args:
         output: output of its process so far.
@@ -200,7 +200,7 @@ _ABOUT_A_RUN = frozenset({"report", "verify", "compare", "judge", "feasible"})
 
 
 def register_outputs(db: Database, state: Path, row: Row, by: str) -> None:
-    """Enter the folder that a job's process has left, if any, and the alarms of a fleet.
+    """Register the run or motion folder that a job's process has left, or raise the drift alarms of its fleet.
 
     Args:
         db: the registry.
@@ -236,7 +236,7 @@ def folder_of(state: Path, row: Row) -> Path | None:
 
 
 def forget_unmade(db: Database, state: Path, row: Row) -> None:
-    """Forget the folder that an ended job was to make, where there is none: after a refusal, for example."""
+    """Clear the folder's id in an ended job's row if the folder was never made: after a refusal, for example."""
     folder = folder_of(state, row)
     if folder is not None and not folder.exists():
         rows.made_nothing(db, row["id"])
@@ -287,7 +287,7 @@ class Orphan:
     since: float
 
     def standing(self, state: Path) -> str:
-        """Return how it stands, in words that follow `END_UNOBSERVED`; empty once it has ended."""
+        """Return words on what the process still does, to follow `END_UNOBSERVED`; empty once it has ended."""
         row, moves = self.row, bool(self.row["motion"])
         lives = alive(self.process)
         has = controlling_pid(control_path(state, row["arm"])) if moves else None
@@ -303,7 +303,7 @@ class Orphan:
 
 
 def held_until(arm: str) -> str:
-    """Return the words that say how long an arm without brakes is held, and what lets it down."""
+    """Return the words `the arm NAME until a person confirms that it is supported`, with the command for that."""
     return f"the arm {arm} until a person confirms that it is supported: `ident supported {arm}`"
 
 
@@ -328,7 +328,7 @@ def explain_interrupted(
     over: Callable[[str], None] = lambda _: None,
     closing: threading.Event | None = None,
 ) -> None:
-    """Follow processes of the previous service until they have ended, and enter what their files show.
+    """Wait until the previous service's processes have ended, SIGTERM sent unless they hold an arm; record each end.
 
     One that holds an arm without brakes may live for hours; its job says so meanwhile.
 

@@ -75,7 +75,7 @@ class Progress:
 
 
 def progress(log: str, elapsed: float, typical: float | None) -> Progress:
-    """Estimate the progress of a running job.
+    """Estimate a running job's phase (last log line), share done and time left, by its log or the usual duration.
 
     Args:
         log: output of the job, its last lines at least.
@@ -171,20 +171,20 @@ class LiveJobs:
         self._thread = threading.Thread(target=self._keep_leases, name="leases", daemon=True)
 
     def start(self) -> None:
-        """Start the thread that watches leases."""
+        """Start the thread that stops motions whose lease is not renewed."""
         self._thread.start()
 
     def close(self) -> None:
-        """Stop the thread that watches leases."""
+        """Tell the thread that watches leases to end; does not wait for it."""
         self._over.set()
 
     @property
     def healthy(self) -> bool:
-        """Return whether the thread that watches leases is alive."""
+        """Return whether the thread that stops motions whose lease is not renewed is alive."""
         return self._thread.is_alive()
 
     def add(self, live: LiveJob, stops: int | None = None) -> None:
-        """Add a job in its place; from now on a stop finds it.
+        """Put a job into the queue, where a stop finds it; refuse it while closing, or after a stop meanwhile.
 
         Args:
             live: the job.
@@ -207,24 +207,24 @@ class LiveJobs:
             self._jobs[live.job] = live
 
     def enter(self, live: LiveJob) -> None:
-        """Let a job that the registry knows begin when its turn comes; its lease begins."""
+        """Start the lease of a job that is in the registry now, and let it begin when its turn comes."""
         with self._lock:
             live.renewed, live.entered = self._now(), True
         self.changed.set()
 
     def keep_from(self, orphans: Mapping[str, frozenset[str]]) -> None:
-        """Let no job begin that needs a resource which a process of the previous service has, by job."""
+        """Set the resources, by job, that processes of the previous service still use; no job that needs one begins."""
         with self._lock:
             self._orphans = dict(orphans)
 
     def orphan_ended(self, job: str) -> None:
-        """Free the resources of a job's process that the previous service had started."""
+        """Release the resources that a process of the previous service, started for this job, has used."""
         with self._lock:
             self._orphans.pop(job, None)
         self.changed.set()
 
     def waits_for(self, job: str) -> str | None:
-        """Return the id of the job that one which has not begun waits for; None for one that could begin, or has."""
+        """Return the id of the job that a queued one waits for; None if it could begin, has begun, or is unknown."""
         with self._lock:
             live = self._jobs.get(job)
             if live is None or live.child is not None:
@@ -248,12 +248,12 @@ class LiveJobs:
         return ""
 
     def remove(self, live: LiveJob) -> None:
-        """Remove a job that has ended, or was not accepted."""
+        """Remove a job that has ended, or was not accepted, from the queue."""
         with self._lock:
             self._jobs.pop(live.job, None)
 
     def entered(self) -> list[LiveJob]:
-        """Return the jobs that the registry knows."""
+        """Return the live jobs that are in the registry."""
         with self._lock:
             return [live for live in self._jobs.values() if live.entered]
 
@@ -266,7 +266,7 @@ class LiveJobs:
         return live.job in self._jobs
 
     def free(self, live: LiveJob, computing: int) -> bool:
-        """Return whether a job may begin: a later job does not overtake an earlier one on the same arm or bus.
+        """Return whether a job may begin: its resources are free of earlier jobs; without any, a place is free.
 
         Args:
             live: the job.
@@ -291,12 +291,12 @@ class LiveJobs:
             child.close()
 
     def end_reason(self, job: str) -> str:
-        """Return why a job is to end, empty while it is not; a motion then ends when its arm rests."""
+        """Return why a job has been asked to end, in words; an empty text while nobody has asked."""
         live = self._jobs.get(job)
         return "" if live is None else live.end_reason
 
     def unentered(self, job: str) -> tuple[str, int | None]:
-        """Return how a job ended whose end cannot be entered yet, and why, with its exit code; else an empty text."""
+        """Return (how a job ended and why that cannot be registered yet, exit code); an empty text for others."""
         live = self._jobs.get(job)
         return ("", None) if live is None else (live.unentered, live.exit_code)
 
@@ -308,11 +308,7 @@ class LiveJobs:
         return None if live is None or not live.order.moves else live.by
 
     def renew(self, job: str) -> float | None:
-        """Renew a motion's lease.
-
-        Returns:
-            How long it lasts now [s]; None where nothing moves or waits under it any more.
-        """
+        """Renew a motion's lease; return how long it lasts now [s], None if nothing moves or waits under it."""
         with self._lock:
             live = self._jobs.get(job)
             if live is None or not live.order.moves or live.end_reason:
@@ -325,11 +321,7 @@ class LiveJobs:
         return lease
 
     def stop(self, arm: str | None, why: str) -> list[str]:
-        """Ask the motions of an arm, or all, to stop; those that wait are not begun.
-
-        Returns:
-            Their ids.
-        """
+        """Ask the motions of an arm, or all if None, to stop, or not to begin; return their ids at once."""
         with self._lock:
             self._stops[arm] += 1
             found = [one for one in self._jobs.values() if one.order.moves and arm in (None, one.order.arm)]
@@ -464,7 +456,7 @@ class Engine:
 
     @property
     def healthy(self) -> bool:
-        """Return whether the queue is being looked after, and the registry can be written."""
+        """Return whether both threads run, the queue's within 30 s, and no job's end waits to be registered."""
         alive = self._thread.is_alive() and self.live.healthy
         return alive and self._now() - self.beat < 30.0 and not any(one.unentered for one in self.live.entered())
 
@@ -477,7 +469,7 @@ class Engine:
         stops: int | None = None,
         entering: Callable[[Row], None] = lambda _: None,
     ) -> Row:
-        """Queue a job.
+        """Queue a job and return its row of the registry.
 
         Args:
             asked: request of the job, its objects named by id.
@@ -517,7 +509,7 @@ class Engine:
         return row
 
     def cancel(self, job: str, by: str) -> None:
-        """End a job: a motion by a controlled stop, a computation by SIGTERM, one that waits at once.
+        """Ask a job to end and return at once: a motion by a controlled stop, a computation by SIGTERM.
 
         Raises:
             UsageError: no such job, or it has ended.
@@ -527,7 +519,7 @@ class Engine:
         self.audit.note(by, "job cancelled", job)
 
     def stop(self, arm: str | None, by: str) -> dict[str, list[str]]:
-        """Bring an arm, or all, to a controlled stop, whoever moves it; motions that wait are cancelled.
+        """Ask for a controlled stop of an arm, or all, whoever moves it; return `arms` reached and `jobs` ended.
 
         Waits for nobody: the word to our own children is a line in a pipe, the control file is memory, and what the
         audit trail says of it is entered later.
@@ -540,13 +532,13 @@ class Engine:
         return {"arms": reached, "jobs": ended}
 
     def ask(self, arm: str, asked: Asked, by: str) -> bool:
-        """Ask the process that moves or holds an arm (`moving_arms.ask_process`); return whether there was one."""
+        """Send `pause`, `resume` or such to the process that moves or holds an arm; return whether there was one."""
         reached = ask_arm(self.state, arm, asked)
         self.audit.note(by, asked, arm, reached=[arm] if reached else [])
         return reached
 
     def progress(self, row: Row) -> Progress | None:
-        """Return the progress of a running job; None for one that does not run."""
+        """Return phase, share done and time left of a running job; None for one that does not run."""
         if row["state"] != "running" or row["started"] is None:
             return None
         typical = rows.typical_seconds(self.db, row["kind"], row["arm"])
@@ -558,7 +550,7 @@ class Engine:
         return moving_arms(self.state)
 
     def begin_closing(self) -> None:
-        """Stop all arms and begin nothing more; returns at once."""
+        """Ask all jobs to end, motions by a controlled stop, and begin nothing more; returns at once."""
         self._closing.set()
         self.live.end_all("the service ends")
         self.live.changed.set()

@@ -21,7 +21,7 @@ _OPTIONS_OF_LOOKS = ("--json", "--with-text", "--state", "--tell-samples")
 
 
 def main() -> int:
-    """Replace this process by the requested command; return only if none, or one not allowed here, was requested."""
+    """Read a request from stdin and replace this process by its command; return 1 without one, 2 if not allowed."""
     line = bytearray()
     # Byte by byte: the input after the line belongs to the command.
     while not line.endswith(b"\n") and len(line) < _MOST:
@@ -48,7 +48,7 @@ def main() -> int:
 
 
 def taken(words: list[str]) -> bool:
-    """Return whether the arguments are a motion under a lease, or a look whose options are known to move nothing."""
+    """Return whether the arguments are a motion under a lease, or a read-only command with known options."""
     if words and words[0] in _VERBS and "--lease-from-stdin" in words:
         return True
     # A list of allowed options: argparse accepts a prefix of an option, such as `--leave`, for the whole.

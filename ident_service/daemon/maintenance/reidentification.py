@@ -41,7 +41,7 @@ _SAME = ("kinematics", "gravity", "terms", "transmission")  # sections whose cha
 
 
 def require_comparable(state: Path, config: ArmConfig) -> int:
-    """Check that an arm can be compared with its current acceptance; return that one's number.
+    """Return the number of an arm's current acceptance; raise if there is none, or its mechanism is not the arm's.
 
     Raises:
         UsageError: nothing was accepted; or the mechanism in the description is another one since.
@@ -59,7 +59,7 @@ def require_comparable(state: Path, config: ArmConfig) -> int:
 
 
 def known_reidentification(db: Database, name: str) -> Row:
-    """Return the re-identification of this id.
+    """Return the row of the re-identification of this id; raise UnknownId where there is none.
 
     Raises:
         UnknownId: there is none.
@@ -77,7 +77,7 @@ def reidentifications(db: Database, arm: str | None = None, *, before: str | Non
 
 
 def conclude(db: Database, row: Row, verdict: Verdict, now: float) -> None:
-    """Enter a verdict: close what was due, and raise a drift alarm if the arm has changed.
+    """Enter a verdict on a running re-identification; close the dues unless `impossible`, raise an alarm if `changed`.
 
     Args:
         db: the registry.
@@ -97,7 +97,7 @@ def conclude(db: Database, row: Row, verdict: Verdict, now: float) -> None:
 def enter_concluded(
     db: Database, arm: str, against: int, recorded: str, run: str, verdict: Verdict, begun: float, by: str, now: float
 ) -> str:
-    """Enter a re-identification whose steps were done at a terminal; return its id.
+    """Enter a re-identification done at a terminal with its verdict, as `conclude` does; return its new id.
 
     Args:
         db: the registry.
@@ -154,11 +154,11 @@ class Reidentifications:
         self._lock = threading.Lock()
 
     def step(self, name: str) -> tuple[str, str] | None:
-        """Return who began a running re-identification, and its present job; None for one unknown to this process."""
+        """Return (who began a running re-identification, id of its present job); None if not of this process."""
         return self._steps.get(name)
 
     def begin(self, wanted: ReidentificationRequest, by: str) -> Row:
-        """Begin a re-identification by queuing its first step.
+        """Begin a re-identification by queuing its first step, the preflight; return its row of the registry.
 
         Args:
             wanted: the request.

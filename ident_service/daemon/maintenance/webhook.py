@@ -78,15 +78,12 @@ class Webhook:
         self._thread.start()
 
     def send(self, kind: str, at: float, data: Mapping[str, Any]) -> str:
-        """Enter a notice to be sent, within the caller's transaction; returns at once.
+        """Write a notice into the registry, from where it is sent later, and return its id; never waits.
 
         Args:
             kind: `arm.due` and so on.
             at: time of the event [s since 1970 in UTC].
             data: JSON values.
-
-        Returns:
-            Its id.
         """
         when = datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
         body = json.dumps({"type": kind, "timestamp": when, "data": dict(data)}, allow_nan=False)
@@ -174,7 +171,7 @@ def deliveries(db: Database, *, before: int | None = None, most: int = 100) -> l
 
 
 def require_address(url: str) -> None:
-    """Check that notices may be sent to an address.
+    """Raise UsageError unless the URL is https, or http to this machine.
 
     Raises:
         UsageError: not https, nor http to this machine.
@@ -192,7 +189,7 @@ def require_address(url: str) -> None:
 
 
 def read_secret(path: Path) -> bytes:
-    """Read the signing secret from a file that only its owner can read.
+    """Return the key that signs notices, from a file that only its owner can read; else raise UsageError.
 
     Args:
         path: of the file: `whsec_` and the key in base 64, as the convention has it, or the key itself.

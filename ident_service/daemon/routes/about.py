@@ -51,7 +51,7 @@ class TokenLine(BaseModel):
     "/healthz", responses={503: {"model": HealthAnswer, "description": "Queue or schedule is not looked after."}}
 )
 def healthz(service: Serving, response: Response) -> HealthAnswer:
-    """Return whether the service looks after its queue and its schedule; asks for no token."""
+    """Answer 200 if queue and schedule are looked after, 503 if not or while closing; needs no token."""
     healthy = service.engine.healthy and service.scheduler.healthy and not service.engine.closing
     response.status_code = 200 if healthy else 503
     return HealthAnswer(healthy=healthy, version=__version__)

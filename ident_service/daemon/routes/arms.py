@@ -152,7 +152,7 @@ def add_arm(service: Serving, who: Operator, body: NewArm) -> answers.AddedArmAn
 
 
 def write_files(place: Path, files: dict[str, str]) -> None:
-    """Write files that came in base 64, by name.
+    """Write files, given as name to base 64 text, into a folder.
 
     Raises:
         UsageError: the content of one is not base 64.
@@ -172,7 +172,7 @@ def get_arm(service: Serving, _: Viewer, arm: ArmName) -> answers.ArmAnswer:
 
 @router.post("/arms/{arm}/challenge", status_code=201)
 def challenge(service: Serving, who: Operator, arm: ArmName) -> answers.ChallengeAnswer:
-    """Make a challenge, which with the typed name confirms one motion; a repeated request moves the arm once."""
+    """Make a challenge: a word that, with the arm's typed name, confirms one motion of the arm, once."""
     name = known.known_arm(service.db, service.state, arm).name
     return answers.ChallengeAnswer(
         arm=name, challenge=service.authenticator.challenge(name, who.name), seconds=CHALLENGE_SECONDS
@@ -187,7 +187,7 @@ def list_faults(service: Serving, _: Viewer, arm: ArmName) -> list[answers.Fault
 
 @router.post("/arms/{arm}/faults/{code}/ack")
 def acknowledge(service: Serving, who: Operator, arm: ArmName, code: Id) -> answers.FaultAnswer:
-    """Acknowledge a fault by its name."""
+    """Acknowledge a fault by its code; return its cause and when it arose."""
     name = known.known_arm(service.db, service.state, arm).name
     file = fault_file(service.state, name)
     since = {one.code: one.since for one in file.remembered()}
@@ -198,13 +198,13 @@ def acknowledge(service: Serving, who: Operator, arm: ArmName, code: Id) -> answ
 
 @router.post("/arms/{arm}/pause")
 def pause(service: Serving, who: Operator, arm: ArmName) -> answers.AskedAnswer:
-    """Pause the motion of an arm; it keeps its lease."""
+    """Pause the motion of an arm, whose lease is to be renewed meanwhile; return whether a process has the arm."""
     return _ask(service, who.name, arm, "pause")
 
 
 @router.post("/arms/{arm}/resume")
 def resume(service: Serving, who: Operator, arm: ArmName) -> answers.AskedAnswer:
-    """Resume the motion of an arm."""
+    """Resume the paused motion of an arm; return whether a process has the arm."""
     return _ask(service, who.name, arm, "resume")
 
 
@@ -232,7 +232,7 @@ def list_acceptances(service: Serving, _: Viewer, arm: ArmName) -> list[answers.
 
 @router.post("/arms/{arm}/acceptances", status_code=201)
 def accept_run(service: Serving, who: Operator, arm: ArmName, body: Acceptance) -> answers.AcceptanceAnswer:
-    """Accept the parameters of a run of this arm."""
+    """Make the parameters of a run of this arm its accepted set."""
     name = known.known_arm(service.db, service.state, arm).name
     folder = run_folder(service.db, service.state, body.run)
     act = accept(service.db, service.state, folder, body.note, who.name, arm=name)
@@ -280,7 +280,7 @@ def get_motion(service: Serving, _: Viewer, motion: Id) -> answers.MotionAnswer:
 def delete_motion(
     service: Serving, who: Operator, motion: Id, anyway: answers.Anyway = False
 ) -> answers.DeletionAnswer:
-    """Delete a motion; runs keep their copy of it."""
+    """Delete a motion, if nothing refers to it or with `anyway`; runs keep their copy of it."""
     return answers.deletion_answer(
         motion, deletion.delete_motion(service.db, service.state, motion, who.name, anyway=anyway)
     )
@@ -288,7 +288,7 @@ def delete_motion(
 
 @router.delete("/arms/{arm}", responses=failures(404, 409))
 def delete_arm(service: Serving, who: Operator, arm: ArmName, anyway: answers.Anyway = False) -> answers.DeletionAnswer:
-    """Delete an uploaded arm, and with it its motions, runs, schedules and acceptances."""
+    """Delete an uploaded arm, with `anyway` all its motions, runs, schedules and acceptances too."""
     return answers.deletion_answer(arm, deletion.delete_arm(service.db, service.state, arm, who.name, anyway=anyway))
 
 
@@ -312,7 +312,7 @@ def check(service: Serving, _: Operator, body: Description) -> DescriptionAnswer
 
 @router.get("/arms/{arm}/home")
 def get_home(service: Serving, _: Viewer, arm: ArmName) -> list[HomeJoint]:
-    """Show the posture in which an arm must stand when it is zeroed; refused for other arms."""
+    """Show the home position of each joint, in which an arm must stand for set-home; refused where none is needed."""
     from ident_service.operations.recovery import home_posture
 
     return [HomeJoint(**asdict(one)) for one in home_posture(known.known_arm(service.db, service.state, arm).config)]

@@ -20,7 +20,7 @@ class Checks:
 
     @contextmanager
     def place(self) -> Iterator[None]:
-        """Hold one slot for as long as the block lasts.
+        """Take one of `MOST_CHECKS` slots during the block; raise HTTPException 503 at once where none is free.
 
         Raises:
             HTTPException: 503 where all are taken; waiting would keep a thread from other requests.

@@ -77,7 +77,7 @@ class JobRequest(RequestBody):
 
 
 def require_confirmed(service: Service, arm: str, confirm: Confirmation | None, who: str) -> None:
-    """Refuse a motion that no person has confirmed.
+    """Raise MotionRefused unless the typed name is the arm's and the challenge this caller's; uses that up.
 
     Raises:
         MotionRefused: no confirmation, or one that does not count.
@@ -100,7 +100,7 @@ def require_confirmed(service: Service, arm: str, confirm: Confirmation | None, 
 def create_job(
     service: Serving, who: Operator, body: JobRequest, response: Response, idempotency_key: Key = None
 ) -> answers.JobAnswer:
-    """Begin or queue a job; a computation repeated with the same `Idempotency-Key` is the same job."""
+    """Begin or queue a job, a motion only if confirmed; a computation with an `Idempotency-Key` is queued once."""
     if idempotency_key is None:
         return begin_job(service, who, body)
     if body.job.kind in MOVES:
@@ -122,7 +122,7 @@ def create_job(
 
 
 def begin_job(service: Service, who: Access, body: JobRequest) -> answers.JobAnswer:
-    """Queue the job of a request to the API or of a page.
+    """Queue the job of a request to the API or of a page; refuse a motion that no person has confirmed.
 
     Raises:
         MotionRefused: a motion that no person has confirmed.
@@ -164,7 +164,7 @@ def get_log(service: Serving, _: Viewer, job: Id) -> PlainTextResponse:
 
 @router.get("/jobs/{job}/result")
 def get_result(service: Serving, _: Viewer, job: Id) -> answers.JobResult:
-    """Return what the command of a job answered."""
+    """Return the JSON answer and the text that the command of a job has printed."""
     row = rows.known_job(service.db, job)
     output = process_output(service.state / JOBS / row["id"])
     return answers.JobResult(job=row["id"], **_named({"answer": output.answer, "text": output.text}, service, row))
@@ -179,7 +179,7 @@ async def watch_job(service: Serving, _: Viewer, while_known: WhileAuthorized, j
 
 @router.post("/jobs/{job}/cancel")
 def cancel_job(service: Serving, who: Operator, job: Id) -> answers.JobAnswer:
-    """Cancel a job; a motion comes to a controlled stop, and the job then says what happened."""
+    """Cancel a job, without waiting; a motion comes to a controlled stop, and the job then says what happened."""
     service.engine.cancel(job, who.name)
     return job_answer_document(service, rows.known_job(service.db, job))
 
@@ -203,13 +203,13 @@ async def renew_lease(service: Serving, who: LeaseKeeper, job: Id) -> answers.Le
 
 @router.post("/stop")
 async def stop_all(service: Serving, who: Near) -> answers.StopAnswer:
-    """Stop all arms, under control; needs no lease and no role; on the service's own machine no token either."""
+    """Stop all arms, under control, without waiting; needs no role, on the service's own machine no token."""
     return await _stop(service, None, who)
 
 
 @router.post("/arms/{arm}/stop")
 async def stop_arm(service: Serving, who: Near, arm: ArmName) -> answers.StopAnswer:
-    """Stop an arm, under control; as for all arms; it is no error if no process moves it, but 404 for no arm at all."""
+    """Stop one arm, under control; whoever may stop all may stop one. 404 for an unknown arm, none for one at rest."""
     return await _stop(service, arm, who)
 
 
@@ -234,7 +234,7 @@ async def _may_be_known(service: Service, arm: str) -> bool:
 
 
 def job_answer_document(service: Service, row: Row) -> answers.JobAnswer:
-    """Return a job as the API answers it, without its command's own text, which names paths of this machine."""
+    """Make the API's answer on a job from its row: state, progress, what it waits for; no paths of this machine."""
     found = service.engine.progress(row)
     shown = {key: value for key, value in row.items() if key in answers.JobAnswer.model_fields}
     shown["detail"] = _named(row["detail"], service, row)
@@ -261,7 +261,7 @@ def _named(value: Any, service: Service, row: Row) -> Any:
 
 
 def without_paths(value: Any, state: str, named: Mapping[str, str] = NOTHING) -> Any:
-    """Return values in which paths below the state folder are relative to it.
+    """Make paths in all texts of JSON values relative to the state folder; replace those in `named` by their names.
 
     Args:
         value: JSON values.

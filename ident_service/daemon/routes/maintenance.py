@@ -176,7 +176,7 @@ def list_schedules(service: Serving, _: Viewer, arm: ArmName | None = None) -> l
 
 @router.post("/schedules", status_code=201)
 def add_schedule(service: Serving, who: Operator, body: NewSchedule) -> ScheduleAnswer:
-    """Schedule the re-identification of an arm."""
+    """Schedule the re-identification of an arm by cron, operating hours or maintenance."""
     when = planned.DueRule(body.cron, body.hours, body.maintenance)
     row = planned.add_schedule(service.db, _arm(service, body.arm), when, who.name, time.time(), body.motion)
     return ScheduleAnswer(**row)
@@ -207,7 +207,7 @@ def list_maintenance(
 
 @router.post("/arms/{arm}/maintenance", status_code=201)
 def add_maintenance(service: Serving, who: Operator, arm: ArmName, body: Event) -> EventAnswer:
-    """Enter maintenance that was done.
+    """Enter maintenance that was done; re-identifications that are scheduled after maintenance fall due.
 
     What is scheduled after it falls due, and may begin by itself where that is allowed.
     """
@@ -217,7 +217,7 @@ def add_maintenance(service: Serving, who: Operator, arm: ArmName, body: Event) 
 
 @router.get("/due")
 def list_due(service: Serving, _: Viewer, arm: ArmName | None = None) -> list[DueAnswer]:
-    """List what is due, the earliest first; a re-identification of the arm that comes to a verdict ends it."""
+    """List re-identifications that are due, the earliest first; one that comes to a verdict ends them."""
     return [DueAnswer(**row) for row in planned.pending_with_accepted(service.db, service.state, arm)]
 
 
@@ -238,7 +238,7 @@ def list_reidentifications(
 
 @router.post("/reidentifications", status_code=201)
 def begin_reidentification(service: Serving, who: Operator, body: NewReidentification) -> ReidentificationAnswer:
-    """Re-identify an arm: check, run, identify, compare with the accepted set.
+    """Begin to re-identify an arm: preflight, run, identify, compare with the accepted set.
 
     The lease is renewed until the arm has come to rest.
     """

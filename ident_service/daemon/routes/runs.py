@@ -113,7 +113,7 @@ def get_run(service: Serving, _: Viewer, run: Id) -> answers.RunAnswer:
 
 @router.post("/runs/{run}/labels")
 def label_run(service: Serving, who: Operator, run: Id, body: Labels) -> answers.RunAnswer:
-    """Give a run its tags and its note, in place of those that it had."""
+    """Replace the tags and the note of a run."""
     runs.label_run(service.db, run, body.tags, body.note, who.name)
     return get_run(service, who, run)
 
@@ -149,13 +149,13 @@ def get_report(service: Serving, _: Viewer, run: Id) -> FileResponse:
 
 @router.delete("/runs/{run}", responses=failures(404, 409))
 def delete_run(service: Serving, who: Operator, run: Id, anyway: answers.Anyway = False) -> answers.DeletionAnswer:
-    """Delete a run with its recordings and its report."""
+    """Delete a run with its recordings and its report, if nothing refers to it or with `anyway`."""
     return answers.deletion_answer(run, deletion.delete_run(service.db, service.state, run, who.name, anyway=anyway))
 
 
 @router.post("/recordings/prune")
 def prune(service: Serving, who: Operator, body: Pruning) -> PruningAnswer:
-    """Delete old recordings of runs that nobody accepted and no job needs."""
+    """List old recordings of runs that nobody accepted and no job needs; with `yes`, delete them."""
     unreadable = runs.rebuild_runs(service.db, service.state)
     gone = (
         run_archive.prune(service.db, service.state, body.keep, who.name)

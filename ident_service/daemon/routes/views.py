@@ -138,7 +138,7 @@ class ViewAnswer(BaseModel):
 def view_arm(
     service: Serving, _: Viewer, request: Request, arm: ArmName, motion: Id | None = None, speed: Speed = 1.0
 ) -> Response:
-    """Show an arm along a motion, the description's `own` or one by its id; without any, at home."""
+    """Return what a viewer draws: an arm along a motion, the description's `own` or one by its id, or at home."""
     config = known.known_arm(service.db, service.state, arm).config
     path = None
     if motion is not None and motion != OWN:
@@ -157,14 +157,14 @@ def view_arm(
 
 @router.get("/arms/{arm}/meshes/{sha256}/{joint}", response_class=Response, responses=_BINARY)
 def get_mesh(service: Serving, _: Viewer, arm: ArmName, sha256: ShortHash, joint: JointNumber) -> Response:
-    """Show the triangles of a joint, or of the base (-1); `figure.meshes` of a view has the address."""
+    """Return the triangles of a joint, or of the base (-1), as bytes; a view's `figure.meshes` has the address."""
     triangles = known.mesh_file(service.state, arm, sha256, joint)
     return Response(triangles, media_type="application/octet-stream", headers={"Cache-Control": "private, max-age=600"})
 
 
 @router.get("/runs/{run}/view", response_model=ViewAnswer)
 def view_run(service: Serving, _: Viewer, request: Request, run: Id, name: FileName | None = None) -> Response:
-    """Show the arm of a run as it was measured in the run's recording, the first or one by its name."""
+    """Return what a viewer draws: the arm of a run as measured in its recording, the first or one by its name."""
     there = [one["name"] for one in runs.recordings(service.db, run) if one["deleted"] is None]
     if name is None and not there:
         raise UnknownId(f"the run {run} has no recording")

@@ -47,7 +47,7 @@ class ArmFacts:
 
     @property
     def words(self) -> str:
-        """Return what kind of arm it is, in words."""
+        """Return the kind of the arm in words, for a real one with its driver."""
         return f"real, {self.driver}" if self.driver else WORDS[self.kind]
 
 
@@ -75,7 +75,7 @@ class JointFacts:
 
 
 def arm_facts(state: Path, row: Row) -> ArmFacts:
-    """Return the facts of an arm, of its row in the registry."""
+    """Return kind, driver and number of joints of an arm; `unreadable` as kind where its file cannot be read."""
     try:
         path = description_path(state, row)
         return _facts(path, path.stat().st_mtime_ns)
@@ -90,7 +90,7 @@ def _facts(path: Path, changed: int) -> ArmFacts:
 
 
 def facts_of(config: ArmConfig) -> ArmFacts:
-    """Return the facts of a description."""
+    """Return kind (`recordings`, `simulated`, `real`), driver, number of joints and text of a description."""
     driver = config.driver
     if driver is None:
         return ArmFacts("recordings", "", len(config.joints), config.description)

@@ -120,7 +120,7 @@ class CommissioningWorkflow:
 
 
 def commissioning_workflow(db: Database, state: Path, config: ArmConfig) -> CommissioningWorkflow:
-    """Return the commissioning steps of an arm with their states.
+    """Return an arm's commissioning steps with their states, as its jobs, runs and acceptances show them.
 
     Raises:
         ParameterError: the accepted set cannot be read.
@@ -344,13 +344,13 @@ def _upcoming(service: Service, row: Row, facts: ArmFacts) -> Step | None:
 
 @router.get("/arms/{arm}/picture.svg")
 def show_picture(service: Serving, _: Viewer, arm: ArmName) -> Response:
-    """Draw an arm at home."""
+    """Draw an arm at home, as an SVG."""
     return picture(home_svg(service, arm))
 
 
 @router.get("/arms/{arm}/motion.svg")
 def show_motion(service: Serving, _: Viewer, arm: ArmName, motion: Id | Literal[""] = "") -> Response:
-    """Draw an arm along a motion, the description's own if none is named."""
+    """Draw an arm along a motion, the description's own if none is named, as an SVG."""
     return picture(motion_svg(service, arm, motion))
 
 
@@ -410,7 +410,7 @@ def ask_confirmation(service: Serving, who: Operator, arm: ArmName, form: Form) 
 
 @router.post("/arms/{arm}/move")
 def move(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
-    """Begin a motion that a person has confirmed; the page of its job keeps its lease from then on."""
+    """Queue a motion that a person has confirmed; go to the page of its job, which renews its lease."""
     if form.get("kind") == "rehearse":
         raise UsageError("a rehearsal begins when the button of its page is held")
     asked = _requested_job(arm, form)
@@ -425,7 +425,7 @@ def move(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
 
 @router.post("/arms/{arm}/jobs")
 def compute(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
-    """Queue a job that moves nothing."""
+    """Queue a job that moves nothing, and go to its page."""
     if form.get("kind") not in _KINDS:
         raise UsageError("choose an action on the page of the arm")
     job = jobs.begin_job(service, who, jobs.JobRequest.model_validate({"job": _requested_job(arm, form)}))
@@ -434,7 +434,7 @@ def compute(service: Serving, who: Operator, arm: ArmName, form: Form) -> Respon
 
 @router.post("/arms/{arm}/ack")
 def acknowledge(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
-    """Acknowledge a fault that a person has read."""
+    """Acknowledge a fault that a person has read, and go back to the page of the arm."""
     arms.acknowledge(service, who, arm, form.get("code", ""))
     return see_other(f"/arms/{arm}")
 
@@ -465,7 +465,7 @@ def pause(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response
 
 @router.post("/arms/{arm}/finish")
 def finish(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
-    """End a run early by its regular end."""
+    """End a run early: the rest of the motion is left out, and the arm goes back to its start."""
     arms.finish(service, who, arm)
     return _back(service, arm, form)
 

@@ -67,7 +67,7 @@ class PageRoute(APIRoute):
 
 
 def words_of(error: IdentError | RequestValidationError | ValidationError) -> str:
-    """Return what is wrong with a request, for a person."""
+    """Return what is wrong with a request in words: the error's own, or up to five mistakes found by pydantic."""
     if isinstance(error, IdentError):
         return str(error)
     return "; ".join(f"{'.'.join(map(str, one['loc']))}: {plain_mistake(one)}" for one in error.errors()[:5])
@@ -89,7 +89,7 @@ def see_other(address: str) -> RedirectResponse:
 
 
 def inside(address: str) -> str:
-    """Return the address if it is on this service, else that of the first page."""
+    """Return the address if it is a path on this service, else `/`."""
     good = address.startswith("/") and not address.startswith("//") and "\\" not in address and address.isprintable()
     return address if good else "/"
 

@@ -37,7 +37,7 @@ def list_jobs(service: Serving, who: Viewer, before: Annotated[int, Query(ge=0, 
 
 @router.get("/jobs/{job}")
 def show_job(service: Serving, who: Viewer, job: Id, attended: bool = False) -> Response:
-    """Show one job; `attended` where this page is to keep the lease of its motion."""
+    """Show the page of a job; with `attended` it renews the lease of a motion that the caller began."""
     row = rows.known_job(service.db, job)
     live = row["state"] in rows.LIVE
     attends = attended and live and bool(row["motion"]) and row["created_by"] == who.name and who.role == "operator"
@@ -68,7 +68,7 @@ def show_job(service: Serving, who: Viewer, job: Id, attended: bool = False) -> 
 
 
 def live_joints(service: Service, row: Row) -> list[dict[str, Any]]:
-    """Return the joints of a job that tells samples, with units and limits for its plots; none of others."""
+    """Return name, unit and limits of each joint of a live job that streams samples; an empty list for other jobs."""
     if row["state"] not in rows.LIVE or row["kind"] not in {*RECORDED, READ}:
         return []
     try:
@@ -103,7 +103,7 @@ _NOBODY: Final = Access("page", "viewer")
 
 @router.post("/jobs/{job}/cancel")
 def cancel(service: Serving, who: Operator, job: Id, form: Form) -> Response:
-    """Cancel a job."""
+    """Cancel a job and go back to its page."""
     del form  # reading the form has checked that it comes from a page of this service
     jobs.cancel_job(service, who, job)
     return see_other(f"/jobs/{job}")

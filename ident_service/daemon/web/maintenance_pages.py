@@ -37,7 +37,7 @@ def show(service: Serving, who: Viewer, arm: ArmName) -> Response:
 
 @router.post("/arms/{arm}/schedules")
 def add_schedule(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
-    """Add a schedule."""
+    """Add the form's schedule, or show the page again with what is wrong in the form."""
     when = form.get("when", "")
     body: dict[str, Any] = {"arm": arm, "maintenance": when == "maintenance"}
     if when in ("cron", "hours"):

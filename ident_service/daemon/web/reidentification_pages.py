@@ -87,7 +87,7 @@ class Compared:
 
 
 def steps(db: Database, row: Row) -> tuple[Step, ...]:
-    """Return the steps of a re-identification, in order.
+    """Return the steps of a re-identification in order, each done, busy, ended or open, with its job.
 
     Args:
         db: the registry.
@@ -104,7 +104,7 @@ def steps(db: Database, row: Row) -> tuple[Step, ...]:
 
 
 def compared(db: Database, state: Path, run: str | None, words: str) -> Compared | None:
-    """Return the comparison that these words were concluded from; None if it is missing or was replaced.
+    """Return a run's stored comparison if its verdict has these words; None if missing, changed or replaced since.
 
     Args:
         db: the registry.
@@ -187,7 +187,7 @@ def begin(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response
 
 @router.get("/reidentifications/{name}")
 def show(service: Serving, who: Viewer, name: Id, attended: bool = False) -> Response:
-    """Show one re-identification; `attended` where this page is to keep its lease."""
+    """Show the page of a re-identification; with `attended` it renews the lease, if the caller began that."""
     row = known_reidentification(service.db, name)
     live, job = row["state"] == "running", None if row["job"] is None else rows.known_job(service.db, row["job"])
     attends = attended and live and not row["unattended"] and row["begun_by"] == who.name and who.role == "operator"
@@ -213,7 +213,7 @@ def show(service: Serving, who: Viewer, name: Id, attended: bool = False) -> Res
 
 @router.post("/reidentifications/{name}/cancel")
 def cancel(service: Serving, who: Operator, name: Id, form: Form) -> Response:
-    """End a re-identification: its motion by a controlled stop."""
+    """Cancel the present job of a re-identification, a motion by a controlled stop; between jobs, stop its arm."""
     del form  # reading the form has checked that it comes from a page of this service
     row = known_reidentification(service.db, name)
     if row["state"] != "running" or row["job"] is None:

@@ -66,7 +66,7 @@ def page(name: str, who: Access | None, status: int = 200, **values: Any) -> HTM
 
 
 def picture(svg: str) -> Response:
-    """Return a drawing, which pages show as an image; what is in it can load nothing."""
+    """Return an SVG as the answer to a browser, which may keep it for 10 min; what is in it can load nothing."""
     headers = {
         "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'self'; sandbox",
         "Cache-Control": "private, max-age=600",
@@ -81,13 +81,13 @@ def viewer_page() -> HTMLResponse:
 
 
 def viewer_file() -> bytes:
-    """Read the viewer's script."""
+    """Return the viewer's script."""
     return _vendored().joinpath(VIEWER).read_bytes()
 
 
 @lru_cache(maxsize=1)
 def viewer_version() -> str:
-    """Return the part of the viewer's address that changes with its version."""
+    """Return `PACKAGE-VERSION` of the viewer, a part of its address, so that browsers load a new version."""
     document = json.loads(_vendored().joinpath("rapidoc.json").read_text(encoding="utf-8"))
     return f"{document['package']}-{document['version']}"
 
@@ -108,7 +108,7 @@ def static() -> dict[str, bytes]:
 
 @lru_cache(maxsize=1)
 def mark() -> str:
-    """Return the part of the static files' addresses that changes with their content, so that browsers cache them."""
+    """Return 12 digits of the hash of all static files, a part of their addresses, so that browsers can keep them."""
     return hashlib.sha256(b"".join(static().values())).hexdigest()[:12]
 
 
@@ -128,7 +128,7 @@ def _environment() -> Environment:
 
 
 def when(seconds: float | None) -> Markup:
-    """Format a time [s since 1970] in UTC, in an element that `page.js` turns into the browser's own time."""
+    """Format a time [s since 1970] in UTC as an element that `page.js` turns into local time; a dash for None."""
     if seconds is None:
         return Markup("\u2014")
     at = datetime.fromtimestamp(seconds, UTC)

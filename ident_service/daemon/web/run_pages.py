@@ -74,14 +74,14 @@ class IdentifiedSet:
 
     @property
     def rows(self) -> list[tuple[str, str, float, float | None, str]]:
-        """Return expression, unit, value, deviation and verdict of each base parameter, the least certain first."""
+        """Return (expression, unit, value, deviation, verdict) of each base parameter, unidentified ones first."""
         table = zip(self.expressions, self.units, self.values, self.deviations, self.verdicts, strict=True)
         order = {"unidentified": 0, "weak": 1}
         return sorted(table, key=lambda row: (order.get(row[4], 2), -abs((row[3] or 0.0) / (row[2] or 1.0))))
 
 
 def identified_set(service: Service, run: str) -> IdentifiedSet | None:
-    """Return what pages show of a run's parameters; None where it has no parameter file, or one that cannot be read."""
+    """Return a run's base parameters with their verdicts; None without a parameter file that can be read."""
     files = known.run_files(service.db, service.state, run)
     if PARAMETERS not in files:
         return None
@@ -135,7 +135,7 @@ class RunFacts:
 
 
 def run_facts(service: Service, run: str) -> RunFacts:
-    """Return the facts of a run, as far as its files tell them."""
+    """Return motion, duration, speed, ending, joints and recording of a run, as far as its files tell them."""
     row, folder = known.known_run(service.db, run), known.run_folder(service.db, service.state, run)
     files = known.run_files(service.db, service.state, run)
     ended = _ending(_small(folder / ENDED)) if ENDED in files else {}
@@ -216,7 +216,7 @@ def list_runs(
     parameter: Annotated[list[str] | None, Query(max_length=8)] = None,
     before: BeforeId = None,
 ) -> Response:
-    """Show the table of runs, the newest first, or those of an arm, a kind, a tag or with a text in id or note."""
+    """Show a page of the table of runs, the newest first; kind, tag and text choose among those of the page."""
     labels = known.run_labels(service.db)
     found = known.runs(service.db, arm or None, before=before, most=_RUNS + 1)
     more, found = len(found) > _RUNS, found[:_RUNS]
@@ -263,7 +263,7 @@ def _values(found: IdentifiedSet | None, chosen: list[str]) -> list[tuple[float,
 
 @router.get("/runs/{run}")
 def show_run(service: Serving, who: Viewer, run: Id) -> Response:
-    """Show one run."""
+    """Show the page of a run: its facts, parameters, files and report."""
     answer = runs.get_run(service, who, run)
     sets = service.db.rows("SELECT run FROM parameter_sets WHERE arm = ? AND run <> ?", answer.arm, answer.id)
     made = service.db.row("SELECT id FROM jobs WHERE run = ? AND kind <> 'report' ORDER BY number LIMIT 1", answer.id)
@@ -303,7 +303,7 @@ def label(service: Serving, who: Operator, run: Id, form: Form) -> Response:
 
 @router.get("/overlay")
 def overlay(service: Serving, who: Viewer, run: Annotated[list[Id] | None, Query(max_length=50)] = None) -> Response:
-    """Show the recordings of several runs over each other."""
+    """Show the recordings of several runs of the same joints over each other; any other choice is refused."""
     chosen = list(dict.fromkeys(run or ()))
     if not 2 <= len(chosen) <= _OVERLAID:
         raise UsageError(
@@ -342,7 +342,7 @@ def trend(service: Serving, who: Viewer, arm: ArmName) -> Response:
 
 
 def trends(sets: list[tuple[Row, IdentifiedSet]], reference: str | None) -> list[dict[str, Any]]:
-    """Return a row per base parameter of the newest set: values over the runs, and the change since the accepted set.
+    """Return a row per base parameter of the newest set: values over the runs, change since the accepted set.
 
     Args:
         sets: rows of runs and their parameters, the earliest first.

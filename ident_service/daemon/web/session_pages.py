@@ -36,7 +36,7 @@ def show_login(where: Next = "/") -> Response:
 
 @router.post("/login")
 def log_in(service: Serving, request: Request, form: Form) -> Response:
-    """Exchange the form's token for a session."""
+    """Exchange the form's token for a session and go to the page asked for, or show the form again."""
     where, answer = inside(form.get("next", "/")), see_other(inside(form.get("next", "/")))
     try:
         about.login(service, request, answer, about.Login(token=form.get("token", "").strip()[:200] or "none"))
@@ -74,7 +74,7 @@ def load(version: str, name: str) -> Response:
 
 @router.post("/stop")
 async def stop(service: Serving, request: Request, near: Near, cookie: Cookie = None) -> Response:
-    """Bring all arms to a controlled stop; the same callers may as for the API's stop."""
+    """Bring all arms to a controlled stop and show a page of those reached; whoever may by the API may here."""
     done = await stop_all(service, near)
     back = inside(urlsplit(request.headers.get("referer", "")).path or "/")
     who = service.authenticator.known(None, cookie)

@@ -73,7 +73,7 @@ class ComparedSet:
 
     @property
     def name(self) -> str:
-        """Return a short name: of the folder, or of the file where it is not called as in a folder of results."""
+        """Return a short name: the folder's, or the file's where that is not called `parameters.json`."""
         path = self.path.absolute()
         return path.parent.name if path.name == PARAMETERS else path.name
 
@@ -84,7 +84,7 @@ class ComparedSet:
 
     @cached_property
     def keys(self) -> tuple[Key, ...]:
-        """Return each base parameter's expression in a form that does not depend on how it is written."""
+        """Return each base parameter as sorted pairs (link parameter, rounded coefficient), however it is written."""
         expressions = self.content["base_parameters"]["expressions"]
         return tuple(
             tuple(sorted((name, round(value, _DECIMALS)) for name, value in parse_expression(expression).items()))
@@ -151,7 +151,7 @@ class ComparedSet:
             raise ParameterError(f"{self.path}: {error}") from None
 
     def identified(self, places: NDArray[np.intp], *, free: bool) -> ComparedEstimate | None:
-        """Return the testable values of some parameters, with their covariance; None without a covariance.
+        """Return values, covariance and motion of some base parameters for the tests; None without a covariance.
 
         Args:
             places: indices of the parameters, in the order of the comparison.
@@ -174,7 +174,7 @@ class ComparedSet:
 
 
 def read_side(path: Path) -> ComparedSet:
-    """Read a folder of results or a parameter file.
+    """Read and check a folder of results or a parameter file, to be compared.
 
     Raises:
         UsageError: neither is there.
@@ -213,7 +213,7 @@ class AppliedValues:
         return self.shares is not None and relevant(self.shares)
 
     def worst(self) -> tuple[int, float] | None:
-        """Return the joint, from 0, whose torque the difference changes by the largest share, and that share."""
+        """Return (joint from 0, share) where the difference changes torque by the largest share; None if not known."""
         if self.shares is None:
             return None
         joint = int(np.argmax(self.shares[0]))
@@ -225,7 +225,7 @@ def values_in_use(
     places: Sequence[NDArray[np.intp]],
     compared: tuple[ComparedEstimate, ComparedEstimate] | None,
 ) -> AppliedValues:
-    """Return the values in use of the shared parameters of two sides.
+    """Return both sides' values in use, whether others were tested, and by what share they change torques.
 
     Args:
         sides: the reference and the other.
@@ -293,7 +293,7 @@ class Pair:
 
     @property
     def verdict(self) -> Verdict:
-        """Return the verdict in one word; `impossible` also where friction of another shape was left out."""
+        """Return `changed`, `unchanged` or `impossible`; the last also where friction of another shape was left out."""
         if self.drift is None or (self.drift.verdict == "unchanged" and self.other_shape):
             return "impossible"
         return self.drift.verdict
@@ -313,7 +313,7 @@ class Comparison:
 
     @property
     def verdict(self) -> Verdict:
-        """Return `changed` where any side has changed, else `impossible` where any cannot be tested."""
+        """Return `changed` if any side has changed, else `impossible` if any cannot be tested, else `unchanged`."""
         words = [pair.verdict for pair in self.pairs]
         return "changed" if "changed" in words else "impossible" if "impossible" in words else "unchanged"
 

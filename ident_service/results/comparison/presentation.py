@@ -57,7 +57,7 @@ _GOOD = {
 
 
 def friction_curves(reference: ComparedSet, pair: Pair, place: int) -> list[Figure]:
-    """Return one figure per joint with friction on both sides.
+    """Draw the friction torque of both sides against velocity, one figure per joint that has friction on both.
 
     Args:
         reference: the first side.

@@ -32,7 +32,7 @@ Packed = dict[str, Any]
 
 
 def packed(values: Array) -> Packed:
-    """Pack an array of finite values, of any shape."""
+    """Pack finite values of any shape as 16-bit levels between the lowest and the highest, in base 64."""
     low, high = float(values.min(initial=np.inf)), float(values.max(initial=-np.inf))
     low, high = (low, high) if values.size else (0.0, 0.0)
     step = (high - low) / _LEVELS
@@ -63,7 +63,7 @@ def unpacked(content: Mapping[str, Any], shape: tuple[int | None, ...]) -> Array
 
 
 def packed_mask(mask: Mask) -> Packed:
-    """Pack a mask of shape (n,)."""
+    """Pack a mask of shape (n,), eight values a byte, in base 64."""
     data = np.packbits(mask, bitorder="little").tobytes()
     return {"bits": len(mask), "data": base64.b64encode(data).decode("ascii")}
 

@@ -51,7 +51,7 @@ from ident_service.results.evidence.evidence import (
 
 
 def conditions_of(estimate: Estimate) -> tuple[Condition, ...]:
-    """Return every condition of the feasible set at the link parameters; none where there are no link parameters."""
+    """Return the links and smallest eigenvalue of each condition of the feasible set; none without link parameters."""
     if estimate.delta is None:
         return ()
     found = []
@@ -73,7 +73,7 @@ def bounds_of(tight: tuple[str, ...], conditions: FeasibleSet, base: BaseParamet
 
 
 def posed(model: ArmModel, delta: Array | None, positions: Array) -> PosedArm | None:
-    """Return the arm, with its bodies, in the most telling posture of a motion.
+    """Return frames and bodies of the arm in the posture of a motion where its frames spread most; None without bodies.
 
     Args:
         model: the arm.
@@ -103,7 +103,7 @@ def _most_spread_posture(points: Array) -> int:
 
 
 def ellipsoid(inertial: Array) -> tuple[float, Array, Array | None]:
-    """Return the solid ellipsoid that moves as a body does.
+    """Return mass, centre of mass and half axes of the solid ellipsoid that has a body's inertial parameters.
 
     Args:
         inertial: the ten parameters of eq. 13, about the link frame's origin, shape (10,).
@@ -132,7 +132,7 @@ _GAP = 1.9  # times the usual step; a longer step is a gap
 
 
 def timing(recording: Recording) -> Timing:
-    """Measure how evenly a recording's samples were taken.
+    """Return rate, jitter and gaps of a recording's samples, from the loop's own account where there is one.
 
     Args:
         recording: of two samples at least.
@@ -242,7 +242,7 @@ class Envelope:
         self._any = np.zeros((series, 0), bool)
 
     def add(self, time: Array, values: Array, marked: Mask) -> None:
-        """Add the next samples.
+        """Add the next samples to the extremes of their stretches of time; stretches get longer if they are too many.
 
         Args:
             time: times, not decreasing, not below that of earlier samples [s], shape (samples,).
@@ -302,7 +302,7 @@ class Welch:
         self._window = np.hanning(self.length + 1)[:-1]
 
     def add(self, values: Array, *, opens: bool = False) -> None:
-        """Add the next samples, shape (series, samples); they do not follow the earlier ones where `opens`."""
+        """Add the next samples, shape (series, samples), to spectrum and correlation; after a gap, with `opens`."""
         self._waiting = values if opens else np.hstack([self._waiting, values])
         self._samples += values.shape[1]
         half = self.length // 2
@@ -322,11 +322,11 @@ class Welch:
 
     @property
     def ready(self) -> bool:
-        """Return whether there was a whole segment."""
+        """Return whether at least one whole segment of samples has been added."""
         return self._segments > 0
 
     def density(self) -> tuple[Array, Array]:
-        """Return frequencies [Hz], shape (lines,), and densities, (series, lines), denser at low frequencies."""
+        """Return frequencies [Hz], (lines,), closer together where low, and power spectral density (series, lines)."""
         frequency = np.arange(1, self._density.shape[1]) * self.rate / self.length
         density = self._density[:, 1:] / max(self._segments, 1)
         edges = np.unique(np.geomspace(1, len(frequency) + 1, _LINES + 1).astype(int)) - 1
@@ -335,7 +335,7 @@ class Welch:
         return sums[0], sums[1:]
 
     def correlation(self) -> tuple[Array, Array]:
-        """Return lags [s], shape (lags,), and autocorrelations, (series, lags); zero where a series is zero."""
+        """Return lags [s], (lags,), and autocorrelations, (series, lags), 1 at lag 0; zero where a series is zero."""
         longest = max(1, min(self.length // 2, round(_LONGEST_LAG * self.rate)))
         step = max(1, longest // _LAGS)
         lags = np.arange(0, longest + 1, step)
@@ -345,7 +345,7 @@ class Welch:
 
     @property
     def white(self) -> float:
-        """Return the bound that 95 % of the lags of white noise stay below."""
+        """Return the bound that 95 % of the autocorrelations of white noise stay below."""
         return 1.96 / float(np.sqrt(max(self._samples, 1)))
 
 
@@ -359,7 +359,7 @@ class Scatter:
         self._kept = 0
 
     def add(self, rows: Array) -> None:
-        """Add the next rows, shape (samples, columns)."""
+        """Add the next rows, shape (samples, columns), of which every n-th is kept, so that they stay few enough."""
         first = -self._seen % self._step
         self._seen += len(rows)
         self._rows.append(rows[first :: self._step].copy())
@@ -421,7 +421,7 @@ class FrictionCollector:
         self._points = Scatter()
 
     def add(self, rows: Rows, torque: Array) -> None:
-        """Add the next equations, with their torques as the estimate counts them, shape (samples, joints)."""
+        """Add velocity and non-rigid torque of each drive; `torque` as the estimate counts it, (samples, joints)."""
         if not self._places or not len(rows.time):
             return
         rigid = np.tensordot(self._estimate.beta[self._rigid], rows.H_b[:, self._rigid], axes=(0, 1)).T
@@ -429,7 +429,7 @@ class FrictionCollector:
         self._points.add(np.hstack([rows.velocity @ self._coupling.T, drives]))
 
     def found(self) -> tuple[Friction, ...]:
-        """Return the friction of each drive; none where the model has no friction."""
+        """Return the recorded points and the model's curve of each drive's friction; none where it has no friction."""
         if not self._places:
             return ()
         points = self._points.rows()
@@ -451,7 +451,7 @@ class FrictionCollector:
 
 
 def friction_term(term: JointTerm, velocity: Array, layout: Layout, drive: int) -> Array:
-    """Return the factor of a friction term in steady motion (`model/parameter_layout.py`), shape of `velocity`.
+    """Return the torque of a friction term in steady motion per unit of its coefficient, shape of `velocity`.
 
     Args:
         term: one of the model's friction terms.

@@ -11,7 +11,7 @@ from ident_service.model.parameter_layout import about_center, body_parameters, 
 
 
 def moved(parameters: Array, rotation: Array, translation: Array) -> Array:
-    """Return the body's parameters in another frame.
+    """Return a body's ten parameters of eq. 13, shape (10,), in another frame.
 
     Args:
         parameters: parameters of eq. 13, shape (10,).
@@ -24,13 +24,13 @@ def moved(parameters: Array, rotation: Array, translation: Array) -> Array:
 
 
 def about_origin(mass: float, center: Array, inertia: Array) -> Array:
-    """Return the ten parameters of a body, the inverse of `about_center`, shape (10,)."""
+    """Return the ten parameters of eq. 13, (10,), of mass [kg], centre [m], and inertia about the centre [kg m^2]."""
     L = inertia + mass * (center @ center * np.eye(3) - np.outer(center, center))
     return body_parameters(L, mass * center, mass)
 
 
 def is_real(parameters: Array) -> bool:
-    """Return whether some distribution of positive mass has these parameters."""
+    """Return whether some positive mass distribution has these parameters, by second moments about its centre."""
     mass = parameters[9]
     if not mass > 0.0:
         return False
@@ -60,7 +60,7 @@ def joint_bodies(model: ArmModel, delta: Array) -> Array:
 
 
 def require_real(model: ArmModel, bodies: Array, reader: str) -> None:
-    """Refuse bodies without a real mass distribution, for readers that refuse them.
+    """Raise ModelError if no real mass distribution has one of the bodies, which the program `reader` refuses.
 
     Raises:
         ModelError: no distribution of mass has the inertia of a link.

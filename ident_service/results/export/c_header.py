@@ -49,7 +49,7 @@ _RESULT = re.compile(rf"^    ([a-zA-Z]+)\[(\d+)\] = ({_OPERAND});$")
 
 
 def c_lines(tape: ExpressionGraph, inputs: Mapping[int, str], outputs: Sequence[tuple[str, Value]]) -> list[str]:
-    """Return the body of a C function, indented.
+    """Return the C statements, indented, that compute the outputs of an expression graph from its inputs.
 
     Args:
         tape: recorded expression graph.
@@ -86,7 +86,7 @@ def _operand(value: int | float | None, names: Mapping[int, str]) -> str:
 
 
 def run_c_lines(lines: Sequence[str], arrays: Mapping[str, Array]) -> dict[str, Array]:
-    """Run lines that `c_lines` has written, from their text alone.
+    """Compute, with numpy, the statements that `c_lines` has written, and return the arrays that they write to.
 
     Args:
         lines: the body of a function.
@@ -138,12 +138,12 @@ _Formulas = Callable[[ExpressionGraph, dict[int, Value], dict[str, list[Symbol]]
 
 
 def c_prefix(arm: IdentifiedArm) -> str:
-    """Return the prefix of every name in the header."""
+    """Return the prefix of every name in the header: the arm's name as a C identifier."""
     return identifier(arm.model.config.name)
 
 
 def c_header(arm: IdentifiedArm) -> str:
-    """Return the header, read back and found to have the torques and the mass matrix of the base parameters.
+    """Return the arm as a C header, read back and found to have the torques and mass matrix of the base parameters.
 
     Raises:
         ModelError: what is read back differs.
@@ -335,16 +335,13 @@ static inline void NAME_inverse_dynamics(const double q[], const double dq[], co
 
 
 def read_c_header(text: str, name: str, function: str, states: dict[str, Array]) -> Array:
-    """Run one function of a header from its text.
+    """Compute, from a header's text alone, what one of its functions writes for these states, (values, samples).
 
     Args:
         text: the header.
         name: prefix of the names in it.
         function: `rigid_dynamics`, `friction`, `gravity` or `mass_matrix`.
         states: `q`, `dq` and `ddq`, each of shape (joints, samples).
-
-    Returns:
-        What it writes, shape (values, samples).
 
     Raises:
         ModelError: no such function, or lines that are not generated code.

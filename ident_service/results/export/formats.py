@@ -40,7 +40,7 @@ _LEAST_MASS = 1e-3  # [kg]
 
 
 def csv_export(arm: IdentifiedArm, name: str) -> str:
-    """Return all parameters as a table; numbers read back as the same ones.
+    """Return all parameters as a CSV table, in which all digits of the numbers are kept.
 
     Args:
         arm: arm, with link parameters or without.
@@ -282,7 +282,7 @@ FORMATS: dict[str, Callable[[IdentifiedArm], Export]] = {
 
 
 def known_formats(words: str) -> tuple[str, ...]:
-    """Parse formats named in a list with commas, each once.
+    """Parse the names of formats in a list with commas, each once; raise UsageError for unknown ones or none.
 
     Raises:
         UsageError: none, or one that is not there.
@@ -313,7 +313,7 @@ def export_run(
     *,
     anyway: bool = False,
 ) -> tuple[Export, ...]:
-    """Export a folder of results: all files, or none.
+    """Write a folder of results in some formats into a folder, all files or none; return what was written.
 
     Args:
         run: the folder, every file in it as its manifest says.
@@ -347,7 +347,7 @@ def export_run(
 
 
 def body_notes(arm: IdentifiedArm) -> tuple[str, ...]:
-    """Return notes for files with link values; none for an arm that no body is."""
+    """Return notes for files with link values: one body of many, payload, implausible links; empty without such."""
     if arm.delta is None:
         return ()
     count, size = arm.verdicts.count("unidentified"), arm.base.size
@@ -378,7 +378,7 @@ def _implausible(model: ArmModel, delta: Array) -> tuple[str, ...]:
 
 
 def arm_reach(model: ArmModel) -> float:
-    """Return the longest way from the first joint, wherever mounted, along the frames and the last link [m]."""
+    """Return the reach [m]: the longest way from the first joint, wherever mounted, along the frames and last link."""
     chain = model.chain
     ways = np.zeros(chain.joints)
     for k, parent in enumerate(chain.parents):

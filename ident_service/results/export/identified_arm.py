@@ -60,12 +60,12 @@ class IdentifiedArm:
 
     @property
     def forbidden_note(self) -> str:
-        """Return the mark that every file of values bears that must not be used; else empty."""
+        """Return `DO NOT USE: reasons`, which every file of values that must not be used bears; else empty."""
         return f"DO NOT USE: {'; '.join(self.forbidden)}" if self.forbidden else ""
 
     @property
     def deviations_note(self) -> str:
-        """Return what the standard deviations belong to, where it is not the values beside them; else empty."""
+        """Return a note where the standard deviations are those of other, unconstrained values; else empty."""
         if self.feasible_set == "none" or not any(deviation is not None for deviation in self.sigma):
             return ""
         return (
@@ -74,7 +74,7 @@ class IdentifiedArm:
 
     @cached_property
     def base_delta(self) -> Array:
-        """Return link parameters with the base parameters in base columns alone, shape (layout.size,).
+        """Return link parameters with the arm's torques, zero but in the base columns, shape (layout.size,).
 
         No body has them, and all torques are theirs (eq. 37).
         """
@@ -83,7 +83,7 @@ class IdentifiedArm:
         return delta
 
     def body(self) -> Array:
-        """Return link parameters that a body has, shape (layout.size,).
+        """Return the arm's link parameters, shape (layout.size,); ModelError where no body has its base parameters.
 
         Raises:
             ModelError: no body has these base parameters.
@@ -97,7 +97,7 @@ class IdentifiedArm:
 
 
 def identified_arm(config: ArmConfig, parameters: ParameterFile, source: str, where: Path) -> IdentifiedArm:
-    """Combine an arm and a parameter file.
+    """Check that a parameter file is of an arm and consistent, and combine the two.
 
     Args:
         config: the arm, its friction's shape as identified.

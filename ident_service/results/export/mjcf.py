@@ -35,7 +35,7 @@ _ATTRIBUTES = dict(zip(JOINT_TERMS, ("armature", "damping", "frictionloss"), str
 def mjcf_export(
     model: ArmModel, delta: Array, name: str, said: tuple[str, ...] = (), motion: RecordedMotion | None = None
 ) -> tuple[str, tuple[str, ...]]:
-    """Return the arm as MJCF, after pinocchio has read it back with the same torques.
+    """Return (MJCF text, what it does not carry), after pinocchio has read it back with the same torques.
 
     Args:
         model: the arm.
@@ -43,9 +43,6 @@ def mjcf_export(
         name: of the file, for errors.
         said: statements about its bodies, for a comment in it.
         motion: motion that the arm was identified from, which says how large the torque of what is lost is.
-
-    Returns:
-        The text, and what it does not carry.
 
     Raises:
         ModelError: a link that no real body is, or the file does not say what it should.

@@ -43,14 +43,14 @@ def gravity_of(model: ArmModel) -> tuple[float, float, float]:
 
 
 def disagreement(found: Array, meant: Array) -> float:
-    """Return the largest difference, relative to the largest value meant."""
+    """Return the largest |found - meant| over the largest |meant|; infinite where something found is not finite."""
     if not np.all(np.isfinite(found)):
         return np.inf
     return float(np.abs(found - meant).max() / max(np.abs(meant).max(), np.finfo(float).tiny))
 
 
 def torque(model: ArmModel, delta: Array, states: States) -> Array:
-    """Return the torque of an arm with some link parameters at states of shape (samples, joints); same shape."""
+    """Return the torque of link parameters `delta` at some states [N m or N], shape (samples, joints) as the states."""
     return np.asarray(np.einsum("jps,p->sj", joint_regressor(model.chain, model.layout, *states), delta))
 
 
@@ -64,14 +64,14 @@ def with_terms(model: ArmModel, delta: Array, terms: Collection[JointTerm]) -> A
 
 
 def supported_terms(model: ArmModel, delta: Array, terms: Collection[JointTerm]) -> Carried:
-    """Return which values a format with some joint terms supports: none negative, of joints with an own drive only."""
+    """Map each joint term of a format to a mask of the joints whose value it supports: not negative, with own drive."""
     drives = joint_drives(model.chain, model.layout, delta)
     known = [term for term in JOINT_TERMS if term in terms and term in model.layout.terms]
     return {term: drives.own & (drives.of(term) >= 0.0) for term in known}
 
 
 def require_same_torques(model: ArmModel, delta: Array, written: WrittenArm, has: Carried, name: str) -> None:
-    """Check that an arm read from a file predicts the parameters' torques, as far as the format supports them.
+    """Raise ModelError unless an arm read from a file predicts the parameters' torques, in the terms that it carries.
 
     Args:
         model: the arm.
@@ -148,7 +148,7 @@ class RecordedMotion:
         return np.asarray(np.sqrt(np.array(sums) / np.maximum(self.rows, 1.0)))
 
     def in_words(self, model: ArmModel, delta: Array) -> str:
-        """Return the torque of what is lost at each joint that has any, the largest first."""
+        """Describe the torque of `delta`, parameters that are lost, at each joint where it counts, largest first."""
         torques = self.torque(delta)
         own = np.sqrt(self.information.squared_torques() / np.maximum(self.rows, 1.0))
         told = torques > _TOLD * own

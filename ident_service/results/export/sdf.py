@@ -42,7 +42,7 @@ _ENTITIES = {"&quot;": '"', "&apos;": "'"}
 def read_sdf(
     text: str, name: str, gravity: tuple[float, float, float], joint_names: Mapping[str, str] | None = None
 ) -> WrittenArm:
-    """Read a model of revolute, continuous and prismatic joints that stands on `world`, parents before children.
+    """Read an SDF model of revolute, continuous and prismatic joints that stands on `world`; raise for any other.
 
     Args:
         text: the file.
@@ -165,7 +165,7 @@ _ENTRIES = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (
 def sdf_export(
     model: ArmModel, delta: Array, name: str, said: tuple[str, ...] = (), motion: RecordedMotion | None = None
 ) -> tuple[str, tuple[str, ...], tuple[str, ...]]:
-    """Return the arm as SDF, after it was read back with the same torques.
+    """Return (SDF text, what it does not carry, notes), after it was read back with the same torques.
 
     Args:
         model: the arm.
@@ -173,9 +173,6 @@ def sdf_export(
         name: of the file, for errors.
         said: statements about its bodies, for a comment in it.
         motion: motion that the arm was identified from, which says how large the torque of what is lost is.
-
-    Returns:
-        The text, what it does not carry, and notes.
 
     Raises:
         ModelError: a link that no real body is, or the file does not say what it should.

@@ -68,16 +68,16 @@ class Element:
     children: list[Element] = field(default_factory=list)
 
     def all(self, tag: str) -> Iterator[Element]:
-        """Return the element's own children of a name."""
+        """Iterate over the element's own children with this tag."""
         return (child for child in self.children if child.tag == tag)
 
     def first(self, tag: str) -> Element | None:
-        """Return the first of the element's own children of a name; None where there is none."""
+        """Return the first of the element's own children with this tag; None where there is none."""
         return next(self.all(tag), None)
 
     @property
     def open(self) -> bool:
-        """Return whether the element has an end tag."""
+        """Return whether the element has an end tag of its own, unlike `<tag/>`."""
         return self.foot != self.head or self.end != self.head
 
 
@@ -91,7 +91,7 @@ class Edit:
 
 
 def xml_places(text: str, name: str) -> Element:
-    """Return the root element of a text, with all others in it.
+    """Parse XML into elements that know their places [bytes] in the text; return the root, others are its children.
 
     Raises:
         ModelError: not well-formed, a document type or entities in it, or more than 200 elements in one another.
@@ -146,7 +146,7 @@ def _end_of_tag(data: bytes, start: int) -> int:
 
 
 def edited(text: str, edits: Sequence[Edit]) -> str:
-    """Return the text with all edits, which do not overlap; those at one place in their order."""
+    """Return the text with its byte ranges replaced as the edits say, which do not overlap; at one place in order."""
     data, parts, at = text.encode("utf-8"), [], 0
     for edit in sorted(edits, key=lambda edit: (edit.start, edit.end)):
         parts += [data[at : edit.start], edit.text.encode("utf-8")]
@@ -193,7 +193,7 @@ _FRICTION: dict[JointTerm, str] = {"viscous": "damping", "coulomb": "friction"}
 
 
 def original_urdf(model: ArmModel, delta: Array, has: Carried) -> tuple[str, tuple[str, ...]]:
-    """Return the original file with identified values.
+    """Return the arm's own URDF text with identified values put in, all else unchanged, and notes on its bodies.
 
     Args:
         model: model of an arm that a URDF describes.
@@ -384,7 +384,7 @@ _TERMS: tuple[JointTerm, ...] = ("viscous", "coulomb")
 def urdf_export(
     model: ArmModel, delta: Array, name: str, said: tuple[str, ...] = (), motion: RecordedMotion | None = None
 ) -> tuple[str, tuple[str, ...], tuple[str, ...]]:
-    """Return the identified URDF, after pinocchio has read it back with the same torques.
+    """Return (URDF text, what it does not carry, notes), after pinocchio has read it back with the same torques.
 
     Args:
         model: the arm.
@@ -392,9 +392,6 @@ def urdf_export(
         name: of the file, for errors.
         said: statements about its bodies, for a comment at its end.
         motion: motion that the arm was identified from, which says how large the torque of what is lost is.
-
-    Returns:
-        The text, what it does not carry, and notes.
 
     Raises:
         ModelError: a link has no positive mass, or the file does not say what it should.

@@ -13,7 +13,7 @@ def identifier(name: str) -> str:
 
 
 def unique(names: Iterable[str]) -> tuple[str, ...]:
-    """Return the names, repeated ones numbered."""
+    """Return the names, each repetition with `_2`, `_3` and so on at its end."""
     taken: set[str] = set()
     found = []
     for name in names:
@@ -32,5 +32,5 @@ def comments(lost: Sequence[str], said: Sequence[str]) -> tuple[str, ...]:
 
 
 def plain(text: str) -> str:
-    """Return text that ends no comment, in C or in XML, and begins no other line."""
+    """Return text with `_` for what could end a comment in C or XML or break its line, and single hyphens."""
     return re.sub(r"-{2,}", "-", re.sub(r"[^A-Za-z0-9 _.,:;+*()=^%-]", "_", text))

@@ -67,7 +67,7 @@ class Figure:
     more: tuple[str, str] | None = None
 
     def svg(self, *, inline: bool = False) -> str:
-        """Return the drawing as a file of its own, or for a page that has the style sheet."""
+        """Return the drawing as SVG text, as a file of its own, or if `inline` for a page that has the style sheet."""
         return self.canvas.svg(self.title, self.description, inline=inline)
 
 
@@ -118,7 +118,7 @@ def _name(canvas: Canvas, name: str) -> None:
 
 
 def torque_figures(evidence: Evidence, recording: int, mechanism: Chain | None = None) -> list[Figure]:
-    """Draw one figure per joint of a recording, with the posture of its largest residual where there is a mechanism."""
+    """Draw measured torque, predicted torque and residual over a recording, one figure per joint."""
     return [_torque_figure(evidence, recording, joint, mechanism) for joint in range(len(evidence.joints))]
 
 
@@ -217,7 +217,7 @@ _FRICTION_TOP, _FRICTION_HEIGHT, _FRICTION_BOTTOM = 42.0, 200.0, 40.0
 
 
 def friction_figures(evidence: Evidence) -> list[Figure]:
-    """Draw one figure per drive; none where the model has no friction."""
+    """Draw recorded friction and the model's curve against velocity, one figure per drive; none without friction."""
     figures = []
     for drive, friction in enumerate(evidence.friction):
         name = evidence.joints[drive]
@@ -265,7 +265,7 @@ _RESIDUAL_TOP, _RESIDUAL_HEIGHT, _RESIDUAL_BETWEEN, _RESIDUAL_BOTTOM = 42.0, 120
 
 
 def residual_figures(evidence: Evidence) -> list[Figure]:
-    """Draw one figure per joint: the first recording that was fitted to, and the first that was not."""
+    """Draw spectrum and autocorrelation of each joint's residual, for one recording fitted to and one not."""
     shown = []
     for role in ("identification", "validation"):
         shown += [one for one in evidence.recordings if one.role == role and one.spectra][:1]
@@ -338,7 +338,7 @@ _TIMING_TOP, _TIMING_HEIGHT, _TIMING_BOTTOM = 28.0, 150.0, 40.0
 
 
 def timing_figures(evidence: Evidence, parameters: ParameterFile) -> list[Figure]:
-    """Draw the sample timing of each recording; the parameter file has the standard deviation of its steps, or not."""
+    """Draw the sample timing of each recording, with the deviation of its steps where the parameter file has it."""
     found = parameters.content.get("recording_quality", [])
     known = {one["recording"]: float(one["jitter_seconds"]["standard_deviation"]) for one in found}
     return [
@@ -455,7 +455,7 @@ def correlations(parameters: ParameterFile) -> Array | None:
 
 
 def strongest_pairs(correlation: Array) -> list[tuple[int, int, float]]:
-    """Return the pairs of parameters that are hardest to tell apart, the hardest first."""
+    """Return (index, index, correlation) of the five most correlated pairs of parameters, the strongest first."""
     rows, columns = np.tril_indices(len(correlation), -1)
     values = np.nan_to_num(correlation[rows, columns])
     order = np.argsort(-np.abs(values), kind="stable")[:_PAIRS]
@@ -597,7 +597,7 @@ _SMALLEST = 0.01  # share of the picture below which nothing is seen beside the 
 
 
 def body_figures(evidence: Evidence) -> list[Figure]:
-    """Return the arm from the side and from above; none where there are no link parameters."""
+    """Draw the arm with its bodies from the side and from above; no figures where there are no link parameters."""
     if evidence.posed is None:
         return []
     where = "in one posture of the recordings" if evidence.recordings else "in the middle of the joints' ranges"

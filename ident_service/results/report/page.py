@@ -40,7 +40,7 @@ _JOINTS = 8  # rows of the table on top before others are folded
 
 
 def assessment_table(found: Assessment) -> Table | None:
-    """Return the table on top: a row per joint, the worst first; None where the file has no torque errors."""
+    """Return the report's first table, each joint's torque errors and verdict; None where the file has no errors."""
     if not found.joints:
         return None
     unseen = any(one.unseen is not None for one in found.joints)
@@ -61,7 +61,7 @@ def _quantity(value: float | None, unit: str) -> Cell:
 
 
 def joint_rule() -> str:
-    """Return the meaning of the columns and words of the table on top."""
+    """Return the meaning of the columns and words of the report's first table."""
     return (
         f"Use: below {POOR:g} %; use with care: above, near standstill or in motion; do not use: above {USELESS:g} % "
         "in motion. Fitted: recordings fitted to; unseen: the worst recording that was not; moving: without rows near "
@@ -150,7 +150,7 @@ def error_table(evidence: Evidence) -> Table:
 
 
 def joint_table(joints: Sequence[JointAssessment], parameters: ParameterFile) -> Table | None:
-    """Return the torque error per joint on every recording; None where the table on top has all of them."""
+    """Return the torque error per joint on every recording; None with fewer than two recordings not fitted to."""
     unseen = parameters.content.get("validation", [])
     if len(unseen) < 2:
         return None

@@ -55,7 +55,7 @@ class Table:
 
     @property
     def numbers(self) -> list[bool]:
-        """Return which columns hold numbers."""
+        """Return whether each column holds numbers."""
         return [any(row[k].value is not None for row in self.rows) for k in range(len(self.heads))]
 
     @property
@@ -72,7 +72,7 @@ def drawing(figure: Figure) -> Markup:
 
 
 def inline(svg: str) -> Markup:
-    """Return a drawing that was made for a page that has the style sheet; its texts are quoted by the canvas."""
+    """Mark an SVG text, made for a page that has the style sheet, as markup that a template does not quote."""
     return Markup(svg)  # noqa: S704
 
 

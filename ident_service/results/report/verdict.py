@@ -69,7 +69,7 @@ def simulation_notice(evidence: Evidence, config: ArmConfig) -> str:
 
 
 def verdict(evidence: Evidence, parameters: ParameterFile) -> list[str]:
-    """Return the verdict in sentences.
+    """Return the verdict in sentences: feasibility, torque prediction, certainty of parameters, condition number.
 
     Args:
         evidence: evidence that was gathered while the estimate was at hand.
