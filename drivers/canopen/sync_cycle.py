@@ -257,22 +257,24 @@ class Buses:
         """
         self._discard_received()
         self.command(NmtCommand.ENTER_PRE_OPERATIONAL)
-        missing = {drive.node for drive in self.drives}
+        missing = [set(codec.profile.nodes) for codec in self.codecs]  # two buses may have drives of one number
         last = self.clock.now_ns() + round(AWAKE * 1e9)
-        while missing and (now_ns := self.clock.now_ns()) < last:
-            for codec, link in self._pairs:
-                asked = missing & set(codec.profile.nodes)
+        while any(missing) and (now_ns := self.clock.now_ns()) < last:
+            for (codec, link), asked in zip(self._pairs, missing, strict=True):
                 for node in sorted(asked):
                     link.send(Frame(SDO_REQUEST + node, _ASK))
                 again = now_ns + round(TIMEOUT * 1e9)
                 while asked and (frame := link.receive(again)) is not None:
                     asked.discard(frame.identifier - SDO_REPLY)
                     codec.receive(frame)
-                missing -= set(codec.profile.nodes) - asked
-        if missing:
-            nodes = ", ".join(map(str, sorted(missing)))
+        if any(missing):
+            silent = ", ".join(
+                f"{node} on {codec.profile.bus.channel}" if len(self.codecs) > 1 else str(node)
+                for codec, nodes in zip(self.codecs, missing, strict=True)
+                for node in sorted(nodes)
+            )
             raise DriverError(
-                f"no answer of drives {nodes} within {AWAKE:g} s; check power, cable and bit rate (`ident bus scan`)"
+                f"no answer of drives {silent} within {AWAKE:g} s; check power, cable and bit rate (`ident bus scan`)"
             )
 
     def begin(self) -> None:

@@ -650,7 +650,7 @@ def _stop(arguments: argparse.Namespace) -> Answer:
     os.umask(0o077)  # and no more: a stop is not refused for a folder that others can enter, or that is another's
     try:
         return _stopped(arguments, state_folder(arguments))
-    except (UsageError, PermissionError):
+    except (UsageError, DriverError, PermissionError):
         if (refusal := access_refusal(state_folder(arguments))) is None:
             raise
         raise UsageError(

@@ -608,7 +608,8 @@ def fingerprint(task: Task, seed: int) -> str:
         digest.update(part.encode() + b"\0")
     limits = [task.limits.lower, task.limits.upper, task.limits.torque]
     limits += [] if task.limits.motors is None else [task.limits.motors.torque]
-    for array in (task.model.prior, task.scale, task.noise, task.added, *limits):
+    friction = () if (guess := task.friction) is None else (guess.coulomb, guess.viscous, guess.offset)
+    for array in (task.model.prior, task.scale, task.noise, task.added, *limits, *friction):
         digest.update(b"none" if array is None else np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
 
@@ -654,8 +655,8 @@ def read_found(file: Path, task: Task, seed: int) -> SearchResult:
             raise UsageError(f"{file}: not a search that this software wrote")
         if content["task_sha256"] != fingerprint(task, seed):
             raise UsageError(
-                f"{file}: a search with another arm, criterion, margin, seed or motion; give the same ones, or omit "
-                "--resume"
+                f"{file}: a search with another arm, criterion, margin, friction, seed or motion; give the same ones, "
+                "or omit --resume"
             )
         candidates = tuple(
             Candidate(int(one["start"]), float(one["value"]), np.array(one["coefficients"], dtype=float))

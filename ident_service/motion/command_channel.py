@@ -194,11 +194,14 @@ class ControlFile:
 
         Raises:
             UsageError: no process moves the arm.
+            DriverError: the file cannot be opened, so that nobody can tell.
         """
         try:
             fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
-        except OSError:
+        except (FileNotFoundError, NotADirectoryError):
             raise UsageError(f"the arm is not moving ({path} does not exist)") from None
+        except OSError as error:
+            raise _unreachable(path, error) from None
         try:
             fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except OSError:
@@ -217,6 +220,7 @@ class ControlFile:
 
         Raises:
             UsageError: the file cannot be written; an arm that moves has been stopped all the same.
+            DriverError: the file cannot be opened: an arm that moves has NOT been stopped.
         """
         refusal: OSError | None = None
         try:
@@ -376,11 +380,17 @@ def stop_requested_ns(path: Path) -> int:
 
 
 def in_use(path: Path) -> bool:
-    """Return whether a process holds the lock of a control file, as the one that moves the arm does."""
+    """Return whether a process holds the lock of a control file, as the one that moves the arm does.
+
+    Raises:
+        DriverError: the file cannot be opened, so that nobody can tell.
+    """
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except (FileNotFoundError, NotADirectoryError):
         return False
+    except OSError as error:
+        raise _unreachable(path, error) from None
     try:
         fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except OSError:
@@ -388,6 +398,13 @@ def in_use(path: Path) -> bool:
     finally:
         os.close(fd)
     return False
+
+
+def _unreachable(path: Path, error: OSError) -> DriverError:
+    return DriverError(
+        f"{path}: cannot be opened: {error.strerror}; it cannot be told whether the arm moves, and a process that "
+        "moves it was not reached over this file. If it moves, use the emergency stop"
+    )
 
 
 def _locked(fd: int) -> bool:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
-from ident_service.errors import UsageError
+from ident_service.errors import DriverError, UsageError
 from ident_service.motion.command_channel import ControlFile, controlling_pid
 from ident_service.registry.state_folder import control_path
 
@@ -18,6 +17,9 @@ def stop_arms(state: Path, arm: str | None) -> list[str]:
     Args:
         state: the state folder.
         arm: name of the arm; None for all that ever moved.
+
+    Raises:
+        DriverError: the control file of one cannot be opened; all others have been reached.
     """
     return _reach(state, arm, ControlFile.stop_motions)
 
@@ -35,6 +37,7 @@ def ask_process(path: Path, asked: Asked) -> int:
 
     Raises:
         UsageError: no process holds it.
+        DriverError: the file cannot be opened.
     """
     with ControlFile.reach(path) as controls:
         if asked == "supported":
@@ -68,9 +71,15 @@ def moving_arms(state: Path) -> list[str]:
 def _reach(state: Path, arm: str | None, act: Callable[[Path], int | None]) -> list[str]:
     place = state / "arms"
     there = [path.name for path in place.iterdir()] if place.is_dir() else []
-    reached = []
+    reached, unreachable = [], []
     for name in there if arm is None else [arm] if arm in there else []:
-        with suppress(UsageError):  # no process moves it
+        try:
             if act(control_path(state, name)) is not None:
                 reached.append(name)
+        except DriverError as error:
+            unreachable.append(error)  # the others first: one arm keeps no stop from another
+        except UsageError:  # no process moves it
+            pass
+    if unreachable:
+        raise unreachable[0]
     return sorted(reached)

@@ -182,6 +182,19 @@ def test_drives_that_do_not_answer_are_named(silent: tuple[int, ...]) -> None:
         bench.arm.exchange(None)
 
 
+@pytest.mark.parametrize("silent", [0, 1])
+def test_drives_of_one_number_on_two_buses_answer_for_themselves(silent: int) -> None:
+    buses = [{"interface": "lock_step", "channel": channel} for channel in ("left", "right")]
+    told = weightless_config(buses=buses, drives=[one | {"node": 3, "bus": bus} for bus, one in enumerate(drives())])
+    bench = Bench(told)
+    bench.arm.open()
+    bench.arm.close()
+    bench = Bench(told)
+    bench.behind.inject(DriveFault("node_silent", silent))
+    with pytest.raises(DriverError, match=f"no answer of drives 3 on {('left', 'right')[silent]} within 2 s"):
+        bench.arm.open()
+
+
 @pytest.mark.parametrize(
     ("index", "subindex", "words"),
     [

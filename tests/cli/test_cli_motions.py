@@ -100,9 +100,9 @@ def test_design_goes_on_from_an_earlier_search(designed: DesignedBefore, tmp_pat
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        (("--seed", 1), "another arm, criterion, margin, seed or motion"),
-        (("--criterion", "condition_number"), "another arm, criterion, margin, seed or motion"),
-        (("--harmonics", 3), "another arm, criterion, margin, seed or motion"),
+        (("--seed", 1), "another arm, criterion, margin, friction, seed or motion"),
+        (("--criterion", "condition_number"), "another arm, criterion, margin, friction, seed or motion"),
+        (("--harmonics", 3), "another arm, criterion, margin, friction, seed or motion"),
     ],
 )
 def test_a_search_for_something_else_is_not_gone_on_with(

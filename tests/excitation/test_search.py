@@ -18,7 +18,15 @@ from design_bench import quick, small
 from ident_service.errors import UsageError
 from ident_service.excitation.design import complete_task, design_motion, family, safe_posture
 from ident_service.excitation.optimal_design import Problem
-from ident_service.excitation.search import Budget, Progress, SearchResult, search, within_limits
+from ident_service.excitation.search import (
+    Budget,
+    Progress,
+    SearchResult,
+    found_to_json,
+    read_found,
+    search,
+    within_limits,
+)
 
 GRID = 60
 
@@ -103,6 +111,17 @@ def test_a_search_goes_on_where_it_ended() -> None:
 
 
 @pytest.mark.slow
+def test_a_search_with_another_guess_of_friction_is_another_search(tmp_path: Path) -> None:
+    """Its candidates follow otherwise, so that what it found may not follow at all."""
+    model, design = small(), quick(friction_guess=(0.1, 0.05))
+    other = complete_task(model, design, *family(design, model))
+    file = tmp_path / "search.json"
+    file.write_text(found_to_json(starts(0), TASK))
+    assert read_found(file, TASK, 5).seed == 5
+    with pytest.raises(UsageError, match="another arm, criterion, margin, friction"):
+        read_found(file, other, 5)
+
+
 def test_going_on_without_another_start_never_makes_the_best_worse() -> None:
     found, _ = searched(1)
     for _ in range(3):

@@ -8,8 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from ident_service.cli import main
 from ident_service.errors import DriverError, UsageError
-from ident_service.motion.command_channel import ControlFile
+from ident_service.motion.command_channel import ControlFile, in_use
+from ident_service.operations.moving_arms import stop_arms
+from ident_service.registry.state_folder import control_path
 
 
 class Time:
@@ -143,6 +146,29 @@ def test_a_stop_that_cannot_be_written_says_so(tmp_path: Path) -> None:
     (tmp_path / "arm").write_text("", encoding="utf-8")
     with pytest.raises(UsageError, match="cannot be written"):
         ControlFile.stop_motions(loop_path(tmp_path))
+
+
+def test_an_arm_whose_controls_cannot_be_opened_is_not_said_to_be_at_rest(tmp_path: Path) -> None:
+    """Its process would not have been stopped. Others are, in the same call."""
+    state = tmp_path / "state"
+    for name in ("before", "moving", "unknown", "within"):
+        control_path(state, name).parent.mkdir(parents=True)
+    for name in ("before", "unknown", "within"):
+        control_path(state, name).mkdir()  # nobody can open it as a file, whoever they are
+    blocked = control_path(state, "unknown")
+    with pytest.raises(DriverError, match="it cannot be told whether the arm moves"):
+        ControlFile.stop_motions(blocked)
+    with pytest.raises(DriverError, match="cannot be opened: Is a directory"):
+        ControlFile.reach(blocked)
+    with ControlFile.take(control_path(state, "moving"), None) as loop:
+        with pytest.raises(DriverError, match="use the emergency stop"):
+            stop_arms(state, None)
+        assert loop.stop
+    assert main(["stop", "--state", str(state)]) == 1
+    blocked.rmdir()
+    blocked.symlink_to(blocked)
+    with pytest.raises(DriverError, match="Too many levels of symbolic links"):
+        in_use(blocked)
 
 
 def test_a_stop_that_comes_while_the_controls_are_taken_is_not_lost(tmp_path: Path) -> None:
