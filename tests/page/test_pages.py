@@ -7,6 +7,7 @@ import re
 import shutil
 import time
 from collections.abc import Iterator
+from html import unescape
 from html.parser import HTMLParser
 from itertools import pairwise
 from pathlib import Path
@@ -23,6 +24,7 @@ from ident_service.daemon.app import PAGES
 from ident_service.daemon.jobs.requests import Base
 from ident_service.daemon.maintenance.reidentification import enter_concluded
 from ident_service.daemon.web.render import STATIC, mark, static
+from ident_service.daemon.web.run_pages import IdentifiedSet
 from ident_service.operations.drift_alarms import Verdict, alarms
 from ident_service.operations.maintenance_schedule import DueRule, add_event, add_schedule, events, pending, schedules
 from ident_service.operations.run_archive import import_run
@@ -429,6 +431,38 @@ def test_a_motion_is_confirmed_knowing_its_length_speed_and_reach(daemon: Asked)
     picture = daemon.get(f"/arms/{ARM}/motion.svg")
     assert "side view" in picture.text
     assert "top view" in picture.text
+
+
+def test_parameters_are_shown_the_least_certain_first() -> None:
+    numbers = [("a", 1.0, 0.5, "weak"), ("b", 0.0, None, "unidentified"), ("c", 5.0, 4.0, "unidentified")]
+    numbers += [("d", -2.0, 0.2, "identified"), ("e", 0.0, 0.0, "identified"), ("f", 1e-6, 1e-6, "identified")]
+    names, values, deviations, verdicts = zip(*numbers, strict=True)
+    found = IdentifiedSet("use", "", (), (), (), names, ("",) * 6, values, deviations, verdicts)
+    assert [row[0] for row in found.rows] == ["b", "c", "a", "f", "d", "e"]
+
+
+def test_the_table_of_runs_is_searched_beyond_its_first_page(daemon: Asked) -> None:
+    db = daemon.service.db
+    for number in range(450):
+        db.write(
+            "INSERT INTO runs VALUES (?, 'motion', ?, NULL, ?, 'done', NULL, 0.0, NULL)",
+            *(f"r{number}", ("a", "b")[number % 2], float(number)),
+        )
+    db.write("INSERT INTO run_labels VALUES ('r7', ?, 'before the oil change', 0.0, 'me')", json.dumps(["cold"]))
+    enter(daemon, "viewer")
+    for query in ("tag=cold", "text=OIL", "tag=cold&kind=motion&arm=b"):
+        page = daemon.get(f"/runs?{query}").text
+        assert re.findall(r'href="/runs/(r\d+)"', page) == ["r7"], query
+        assert "Earlier runs" not in page
+    page, seen = daemon.get("/runs?kind=motion&text=r").text, list[str]()
+    assert "<option>cold</option>" in page
+    while True:
+        seen += re.findall(r'href="/runs/(r\d+)"', page)
+        if (earlier := re.search(r'href="(/runs\?[^"]*before=[^"]*)"', page)) is None:
+            break
+        assert "kind=motion" in earlier[1]
+        page = daemon.get(unescape(earlier[1])).text
+    assert seen == [f"r{number}" for number in reversed(range(450))]
 
 
 def test_a_run_gets_tags_and_a_note(daemon: Asked, commissioned: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -74,10 +75,16 @@ class IdentifiedSet:
 
     @property
     def rows(self) -> list[tuple[str, str, float, float | None, str]]:
-        """Return (expression, unit, value, deviation, verdict) of each base parameter, unidentified ones first."""
-        table = zip(self.expressions, self.units, self.values, self.deviations, self.verdicts, strict=True)
-        order = {"unidentified": 0, "weak": 1}
-        return sorted(table, key=lambda row: (order.get(row[4], 2), -abs((row[3] or 0.0) / (row[2] or 1.0))))
+        """Return (expression, unit, value, deviation, verdict) of each base parameter, the least certain first."""
+
+        def certain(row: tuple[str, str, float, float | None, str]) -> tuple[int, float]:
+            value, deviation = abs(row[2]), row[3]
+            certainty = 0.0 if deviation is None else value / deviation if deviation > 0.0 else math.inf
+            return {"unidentified": 0, "weak": 1}.get(row[4], 2), certainty
+
+        return sorted(
+            zip(self.expressions, self.units, self.values, self.deviations, self.verdicts, strict=True), key=certain
+        )
 
 
 def identified_set(service: Service, run: str) -> IdentifiedSet | None:
@@ -216,15 +223,16 @@ def list_runs(
     parameter: Annotated[list[str] | None, Query(max_length=8)] = None,
     before: BeforeId = None,
 ) -> Response:
-    """Show a page of the table of runs, the newest first; kind, tag and text choose among those of the page."""
+    """Show a page of the table of runs, the newest first, of those that arm, kind, tag and text choose."""
     labels = known.run_labels(service.db)
-    found = known.runs(service.db, arm or None, before=before, most=_RUNS + 1)
-    more, found = len(found) > _RUNS, found[:_RUNS]
-    earlier = found[-1]["id"] if more else None
-    shown = [{**row, **known.shown_labels(labels, row["id"])} for row in found]
-    kinds = sorted({row["kind"] for row in shown})
-    tags = sorted({one for row in shown for one in row["tags"]})
-    shown = [row for row in shown if _wanted(row, kind, tag, text)]
+    shown, earlier = list[dict[str, Any]](), before
+    while len(shown) < _RUNS:
+        found = known.runs(service.db, arm or None, before=earlier, most=_RUNS + 1)
+        labelled = ({**row, **known.shown_labels(labels, row["id"])} for row in found[:_RUNS])
+        shown += [row for row in labelled if _wanted(row, kind, tag, text)]
+        earlier = found[_RUNS - 1]["id"] if len(found) > _RUNS else None
+        if earlier is None:
+            break
     sets = {row["run"] for row in service.db.rows("SELECT run FROM parameter_sets")}
     for row in shown:
         row["set"] = identified_set(service, row["id"]) if row["id"] in sets else None
@@ -239,8 +247,8 @@ def list_runs(
         runs=shown,
         earlier=earlier,
         arms=[row["arm"] for row in service.db.rows("SELECT DISTINCT arm FROM runs ORDER BY arm")],
-        kinds=kinds,
-        tags=tags,
+        kinds=[row["kind"] for row in service.db.rows("SELECT DISTINCT kind FROM runs ORDER BY kind")],
+        tags=sorted({one for row in labels.values() for one in row["tags"]}),
         filled={"kind": kind, "tag": tag, "text": text},
         expressions=expressions,
         chosen=chosen,
