@@ -323,7 +323,7 @@ class CanopenDriver(ExtendedSection):
 
     @property
     def shares_by_sheet(self) -> bool:
-        """Return whether every drive's data sheet allows dummy mapping, so that drives can share torque frames."""
+        """Return whether each drive's EDS allows dummies of 8 or 16 bits (DummyUsage), for shared torque frames."""
         return all(sheet.dummies & _DUMMIES for sheet in self.sheets)
 
     @property

@@ -149,7 +149,7 @@ def _solution(information: Information, weights: Array | None) -> _Solution:
 
 
 def unit_columns(matrix: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the columns' lengths (1 for columns that are only rounding), and a mask of the columns that are not.
+    """Return the columns' lengths, 1 for columns that are only rounding, and a mask of the other columns.
 
     The Stribeck column of rows that are all fast underflows; divided by its length it would be rounding of unit length.
     """

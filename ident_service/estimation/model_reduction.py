@@ -145,7 +145,7 @@ def essential_parameters(
 
 
 def effective_samples(fit: LeastSquares, covariance: Array, rows: int) -> float:
-    """Return the number of independent rows with the estimate's uncertainty, at least one more than parameters.
+    """Return how many independent rows would give the estimate's uncertainty, at least one more than parameters.
 
     Args:
         fit: the estimate, with its white standard deviations (eq. 81).

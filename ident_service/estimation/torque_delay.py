@@ -90,7 +90,7 @@ def estimate_delay(recordings: Sequence[Recording], model: ArmModel, base: BaseP
 def choose_delay(
     trials_at: Callable[[float], FrictionTrials], period: float, base: BaseParameters, conditions: FeasibleSet
 ) -> tuple[float, Choice | None]:
-    """Return the delay [s] with the smallest held-out error, 0.0 unless one is clearly better; and how it was chosen.
+    """Return the delay [s] of least held-out error, 0.0 unless one is clearly better, and the choice or None.
 
     It is searched for within a few samples, and further on about the largest of them while that one is clearly better.
 

@@ -532,7 +532,9 @@ def _rounded(start: Array, end: Array, radius: float) -> Capsule:
 
 
 def arm_capsules(outline: Outline, kinematics: Kinematics, chain: Chain) -> tuple[dict[str, list[Capsule]], list[str]]:
-    """Return capsules of the arm's links by joint name or `base`, and names of those with an unreadable mesh.
+    """Return `outline`'s capsules by joint name or `base`, if a mesh is among them, and names whose mesh is unread.
+
+    Links without a mesh have none here, as their solids are read from the file; a DH table has none at all.
 
     Args:
         outline: of the file.

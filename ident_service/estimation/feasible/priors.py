@@ -183,7 +183,7 @@ def move_off_boundary(
     likely: LikelyBodies,
     near: ChangeEllipsoid,
 ) -> FeasibleEstimate:
-    """Return the estimate moved into the set towards likely bodies, within `near`; unchanged where the solver fails.
+    """Return the estimate moved into the set towards likely bodies, within `near`; unchanged where none is found there.
 
     Newton's method (`central.py`) needs room to begin: between links of tonnes whose masses cancel there is none.
 
@@ -208,7 +208,7 @@ def move_off_boundary(
         return held
     beta = base.K @ found
     inside = conditions.margin(found)[0]
-    if float(np.linalg.norm(near.moved(beta))) < 1.0 and inside > 0.0:
+    if float(np.linalg.norm(near.scaled_change(beta))) < 1.0 and inside > 0.0:
         return replace(held, beta=beta, delta=found, margin=inside)
     return held
 
