@@ -115,7 +115,7 @@ class TorqueLimit(Section):
     below: Annotated[int, Field(strict=True, ge=1)] | None = None
 
     def held(self, counts: int) -> int:
-        """Return `below` less a limit [counts], at least 0: limit to entry, and back; unchanged without `below`."""
+        """Convert a limit [counts] to the entry's value or back: `below` minus it, at least 0; unchanged without."""
         return counts if self.below is None else max(self.below - counts, 0)
 
 

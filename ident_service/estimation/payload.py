@@ -162,7 +162,7 @@ class Payload:
     excess: Array | None = None
 
     def far(self) -> tuple[int, ...]:
-        """Return indices of joints whose residual is over 4 times the identification's (if known) and 1 % of torque."""
+        """Return indices of joints whose residual is over 1 % of torque and 4 times a known identification's."""
         if self.excess is None:
             return ()
         matters = self.fitted.joint_relative_percent > 100.0 * RELEVANT_TORQUE

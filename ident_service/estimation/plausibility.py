@@ -100,7 +100,7 @@ def reasons_against(estimate: Estimate, recordings: Sequence[Recording] = ()) ->
 
 
 def reasons_in_length(estimate: Estimate, seconds: float) -> tuple[str, ...]:
-    """Return a sentence if too short a motion leaves too much unidentified; none if so, or with validation recordings.
+    """Return a sentence if a motion is short and leaves too much unidentified; () if not, or if others validate it.
 
     A short motion that leaves much unidentified predicts itself and nothing else. Where other recordings validate the
     estimate, their errors judge it.

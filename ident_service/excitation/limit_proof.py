@@ -141,7 +141,7 @@ class PeakBounds:
     def torque_and_power_violations(
         self, names: tuple[str, ...], limits: MotionLimits, supply: Supply | None = None
     ) -> list[str]:
-        """Return a sentence for each exceeded limit of joint torque, motor torque or supply; None is not judged."""
+        """Return a sentence for each limit that a known bound of joint torque, motor torque or power exceeds."""
         found = []
         if self.torque is not None:
             rows = zip(names, self.torque, limits.torque, strict=True)

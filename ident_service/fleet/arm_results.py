@@ -333,7 +333,7 @@ def arm_files(
     store: Store,
     shown: ArmShown,
 ) -> tuple[Files, dict[str, Any]]:
-    """Build one arm's result files, by name, and its summary for the fleet; keep them in the store only.
+    """Build one arm's result files, by name, and its summary, or read them from the store; write them only there.
 
     Args:
         fits: of the arm.
@@ -364,7 +364,7 @@ def side_files(
     more: dict[str, Any],
     store: Store,
 ) -> Files:
-    """Build the result files of some recordings, such as those before a change; keep them in the store only.
+    """Build result files of some recordings, as those before a change, or read them from the store; write only there.
 
     Args:
         keys: keys of the recordings' factors, in the order in which they are merged.

@@ -128,7 +128,7 @@ def _estimates(recordings: Sequence[Recorded], number: int, places: Sequence[int
 
 @one_blas_thread()
 def scatter_of(arms: Mapping[str, Sequence[Recorded]], groups: Mapping[Group, Sequence[int]]) -> dict[Group, Scatter]:
-    """Estimate each group's scatter between an arm's recordings from neighbours in time; none seen, none assumed.
+    """Estimate each group's scatter between an arm's recordings from neighbours in time; zero without neighbours.
 
     Args:
         arms: recordings of each arm, by time.

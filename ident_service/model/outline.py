@@ -532,7 +532,7 @@ def _rounded(start: Array, end: Array, radius: float) -> Capsule:
 
 
 def arm_capsules(outline: Outline, kinematics: Kinematics, chain: Chain) -> tuple[dict[str, list[Capsule]], list[str]]:
-    """Return `outline`'s capsules by joint name or `base`, if a mesh is among them, and names whose mesh is unread.
+    """Return the outline's capsules of each joint (or `base`) that has a mesh, and names of those with an unread one.
 
     Links without a mesh have none here, as their solids are read from the file; a DH table has none at all.
 
