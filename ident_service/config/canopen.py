@@ -433,7 +433,7 @@ def motor_torques(driver: CanopenDriver, transmission: Transmission, torques: Se
 def quick_stop_decelerations(
     driver: CanopenDriver, transmission: Transmission, accelerations: Sequence[float | None]
 ) -> list[int | None]:
-    """Return 6085h of each drive [counts/s^2]: its own setting, else from the joints' limits; None without either.
+    """Return 6085h of each drive [counts/s^2]: its own setting, else by joint `accelerations`; None without either.
 
     Args:
         driver: the section `driver`.

@@ -115,7 +115,7 @@ class TorqueLimit(Section):
     below: Annotated[int, Field(strict=True, ge=1)] | None = None
 
     def held(self, counts: int) -> int:
-        """Convert a limit [counts] to the entry's value or back: `below` minus it, at least 0; unchanged without."""
+        """Return `below` (if set) minus a limit [counts], not under 0, else the limit: from limit to entry, and back."""
         return counts if self.below is None else max(self.below - counts, 0)
 
 

@@ -328,7 +328,7 @@ def reduce_fleet(
     tell: Tell,
     step: Step = lambda words, share: None,
 ) -> Reduced:
-    """Reduce every recording of a fleet on the workers to its factor and row in the store; return them by arm.
+    """Reduce a fleet's recordings on workers to factors and rows in the store; return the rows by arm, and problems.
 
     Args:
         client: of the scheduler.

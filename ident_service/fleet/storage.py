@@ -67,7 +67,7 @@ def _system(url: str) -> tuple[Any, str]:
 
 
 def persistently(action: Callable[[], _Result], url: str, pauses: Sequence[float] = PAUSES) -> _Result:
-    """Call a function that uses storage, again after pauses for transient errors; return its result.
+    """Call a function that uses storage, again after pauses for transient errors; return its result or raise.
 
     Args:
         action: function to call; it can be repeated.

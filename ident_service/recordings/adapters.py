@@ -132,7 +132,7 @@ def overlap(one: Recording, other: Recording) -> bool:
 
 
 def without_standstill(recording: Recording, margin: float) -> RangeRecording:
-    """Return a range without the standstill before the first joint moves and after the last one stops.
+    """Return a range without standstill before the first and after the last motion, but `margin`; raises if none moves.
 
     A joint moves where its mean position over 0.1 s changes by more than 0.005 rad/s or m/s to the next 0.1 s.
 

@@ -114,7 +114,7 @@ class Prior:
 
 
 def residual_deviation(fit: LeastSquares) -> float:
-    """Return the residual's standard deviation that the parameters' deviations are made from (eq. 81).
+    """Return the residual's standard deviation in eq. 81; raises ParameterError if it is zero or no parameter was seen.
 
     Raises:
         ParameterError: no parameter was seen, or the residual is exactly zero.
