@@ -333,7 +333,7 @@ def arm_files(
     store: Store,
     shown: ArmShown,
 ) -> tuple[Files, dict[str, Any]]:
-    """Build one arm's result files, by name, and its summary, or read them from the store; write them only there.
+    """Build one arm's result files, by name, and its summary; the estimate is read from the store, or kept there.
 
     Args:
         fits: of the arm.
@@ -364,7 +364,7 @@ def side_files(
     more: dict[str, Any],
     store: Store,
 ) -> Files:
-    """Build result files of some recordings, as those before a change, or read them from the store; write only there.
+    """Build the result files of some recordings, by name; the estimate is read from the store, or kept there.
 
     Args:
         keys: keys of the recordings' factors, in the order in which they are merged.
