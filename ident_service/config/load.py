@@ -75,7 +75,7 @@ def load_arm(arm: str | Path, *, upload: bool = False) -> ArmConfig:
 
 
 def with_sheets(config: ArmConfig, files: Sequence[str]) -> ArmConfig:
-    """Return the description whose emulated CANopen drives have these EDS or DCF files; unchanged for no files.
+    """Return the description whose emulated CANopen drives have these EDS files; raises UsageError for other drives.
 
     Args:
         config: of the arm.
@@ -142,7 +142,7 @@ def _count(data: bytes) -> int:
 
 
 def load_recording_format(path: str | Path) -> RecordingFormat:
-    """Return the checked content of a YAML file with the keys of an arm description's `recording` only.
+    """Return the checked content of a YAML file with keys of a description's `recording` only; raises ConfigError.
 
     Raises:
         UsageError: no such file.
@@ -152,7 +152,7 @@ def load_recording_format(path: str | Path) -> RecordingFormat:
 
 
 def load_payload(path: str | Path) -> Payload:
-    """Return the checked content of a YAML file with the keys of an arm description's `payload` only.
+    """Return the checked content of a YAML file with keys of a description's `payload` only; raises ConfigError.
 
     Raises:
         UsageError: no such file.

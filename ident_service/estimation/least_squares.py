@@ -58,7 +58,7 @@ class LeastSquares:
 
 
 def weighted_least_squares(information: Information) -> LeastSquares:
-    """Solve least squares with each joint divided by its residual's deviation, repeated until the weights settle.
+    """Solve least squares with each joint divided by its residual's deviation, until weights settle, else ModelError.
 
     Raises:
         ModelError: the weights do not settle, which means that some joint's residual vanishes.

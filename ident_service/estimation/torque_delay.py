@@ -55,7 +55,7 @@ def with_delay(model: ArmModel, seconds: float) -> ArmModel:
 
 
 def estimate_delay(recordings: Sequence[Recording], model: ArmModel, base: BaseParameters) -> Delay:
-    """Return the delay of torque behind position [s] and its deviation, one for all recordings.
+    """Return torque's delay behind position [s] in all recordings, and its deviation; RecordingError if none explains.
 
     Args:
         recordings: of one arm through one chain of measurement.

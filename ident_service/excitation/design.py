@@ -437,7 +437,7 @@ def design_motion(
     tell: Callable[[Progress], None] = lambda _: None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> Designed:
-    """Return the most informative motion that a search within a budget finds, proven to keep every limit.
+    """Return the most informative motion that a search finds, proven to keep all limits; raises MotionRefused if none.
 
     Args:
         model: of the arm, with prior parameters.

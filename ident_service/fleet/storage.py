@@ -95,7 +95,7 @@ def persistently(action: Callable[[], _Result], url: str, pauses: Sequence[float
 
 
 def find(patterns: Sequence[str]) -> list[Source]:
-    """Return the files that patterns name (files, globs, whole folders), sorted by URL, each once.
+    """Return the files that patterns name (files, globs, folders), by URL, each once; UsageError if one names none.
 
     Raises:
         UsageError: a pattern names nothing, or storage that is not known.
