@@ -52,7 +52,7 @@ def huber(
     shares: Array | None = None,
     spread: SpreadRows | None = None,
 ) -> tuple[LeastSquares, Equations, float]:
-    """Return Huber's estimate, the reweighted equations that it solves, and how much its last round changed it.
+    """Return Huber's estimate of the round that changed least, its reweighted equations, and that change [deviations].
 
     The change is in standard deviations. Where the weights do not settle in the rounds that there are, the one that
     changed least is the answer: a change above `SETTLED` says so.

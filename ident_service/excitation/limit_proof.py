@@ -232,7 +232,7 @@ def _drive_rates(velocity: list[TaylorModel], coupling: Array) -> list[TaylorMod
 
 
 def power_bounds(torque: list[TaylorModel], velocity: list[TaylorModel], supply: Supply, coupling: Array) -> Array:
-    """Return the largest power drawn from the supply [W] in each time interval, shape (stretches,).
+    """Return an upper bound of the power drawn from the supply [W] in each time interval, shape (stretches,).
 
     Torque and velocity of the joints are handed to the drives that move them, `tau_drive = C^-T tau`.
     """

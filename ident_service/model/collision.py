@@ -343,7 +343,9 @@ class CollisionModel:
 
 
 def share_touching(model: ArmModel, within: float, postures: int, seed: int) -> dict[tuple[str, str], float]:
-    """Return per pair that must not touch the share of random postures that do, from 0 to 1; moving link first.
+    """Return per pair that must not touch the share (0 to 1) of random postures with less than `within` [m] between.
+
+    Of each pair the moving link comes first.
 
     Args:
         model: model of an arm, also of one whose bodies always touch.

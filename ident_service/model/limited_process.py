@@ -29,7 +29,7 @@ def own_module(module: str, *words: str) -> tuple[list[str], dict[str, str]]:
 
 
 def run_limited_process(module: str, path: Path, deadline: float, *more: str) -> dict[str, Any]:
-    """Run a module on a file in a process with limits; return the JSON object that it prints.
+    """Run a module on a file in a process with limits; return the JSON object that it prints, or raise ModelError.
 
     Args:
         module: module whose `main` calls `answer_within`.
