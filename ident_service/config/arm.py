@@ -598,7 +598,7 @@ class ArmConfig(ExtendedSection):
 
     @property
     def motion_sha256(self) -> str:
-        """Return the SHA-256 of the keys a motion's safety depends on: mechanism, limits, model, surroundings.
+        """Return the SHA-256 of what a motion's safety depends on: mechanism, limits, prior, control, surroundings.
 
         Other estimators, recording formats, motions or drivers leave it as it is.
         """

@@ -323,7 +323,7 @@ class CanopenDriver(ExtendedSection):
 
     @property
     def shares_by_sheet(self) -> bool:
-        """Return whether every drive's data sheet allows dummy mapping, so that drives can share torque frames."""
+        """Return whether each drive's EDS allows dummies of 8 or 16 bits (DummyUsage), for shared torque frames."""
         return all(sheet.dummies & _DUMMIES for sheet in self.sheets)
 
     @property
@@ -433,7 +433,7 @@ def motor_torques(driver: CanopenDriver, transmission: Transmission, torques: Se
 def quick_stop_decelerations(
     driver: CanopenDriver, transmission: Transmission, accelerations: Sequence[float | None]
 ) -> list[int | None]:
-    """Return 6085h of each drive [counts/s^2]: its own setting, else from the joints' limits; None without either.
+    """Return 6085h of each drive [counts/s^2]: its own setting, else by joint `accelerations`; None without either.
 
     Args:
         driver: the section `driver`.

@@ -115,7 +115,7 @@ class TorqueLimit(Section):
     below: Annotated[int, Field(strict=True, ge=1)] | None = None
 
     def held(self, counts: int) -> int:
-        """Convert a torque limit [counts] to the entry's value, or back: `below` less it; unchanged without `below`."""
+        """Return `below` (if set) minus a limit [counts], at least 0, else the limit: from limit to entry, or back."""
         return counts if self.below is None else max(self.below - counts, 0)
 
 

@@ -70,7 +70,7 @@ class DataSheetEntry:
 
     @property
     def readable(self) -> bool:
-        """Return whether a host may read the entry."""
+        """Return whether a host may read the entry: its access type is not `wo`; True for an unknown one."""
         return self.access != "wo"
 
     def number(self, node: int) -> int | None:

@@ -35,7 +35,7 @@ _PER_JOINT = ("encoder_resolution", "torque_resolution", "torque_noise")
 
 
 def find_arm(arm: str) -> Path:
-    """Return the file of an arm given as a path or as the name of a shipped description.
+    """Return the file of an arm given as a path or a shipped description's name; raises UsageError if neither exists.
 
     Raises:
         UsageError: neither exists.
@@ -50,7 +50,7 @@ def find_arm(arm: str) -> Path:
 
 
 def load_arm(arm: str | Path, *, upload: bool = False) -> ArmConfig:
-    """Return the checked description of a YAML file or shipped arm; raises ConfigError with every mistake in it.
+    """Return the checked description of a YAML file or shipped arm; raises ConfigError that lists its mistakes.
 
     Args:
         arm: a YAML file, or the name of a shipped description.
@@ -58,7 +58,8 @@ def load_arm(arm: str | Path, *, upload: bool = False) -> ArmConfig:
 
     Raises:
         UsageError: no such file and no such name.
-        ConfigError: every mistake in it, each with file, line and column.
+        ConfigError: its first mistakes, each with file, line and column; contradictions among keys are looked for only
+            where each key is right in itself.
     """
     path = find_arm(str(arm))
     tree = read_tree(path, upload=upload)
@@ -74,7 +75,7 @@ def load_arm(arm: str | Path, *, upload: bool = False) -> ArmConfig:
 
 
 def with_sheets(config: ArmConfig, files: Sequence[str]) -> ArmConfig:
-    """Return the description whose emulated CANopen drives have these EDS or DCF files; unchanged for no files.
+    """Return the description whose emulated CANopen drives have these EDS files; raises UsageError for other drives.
 
     Args:
         config: of the arm.
@@ -141,7 +142,7 @@ def _count(data: bytes) -> int:
 
 
 def load_recording_format(path: str | Path) -> RecordingFormat:
-    """Return the checked content of a YAML file with the keys of an arm description's `recording` only.
+    """Return the checked content of a YAML file with keys of a description's `recording` only; raises ConfigError.
 
     Raises:
         UsageError: no such file.
@@ -151,7 +152,7 @@ def load_recording_format(path: str | Path) -> RecordingFormat:
 
 
 def load_payload(path: str | Path) -> Payload:
-    """Return the checked content of a YAML file with the keys of an arm description's `payload` only.
+    """Return the checked content of a YAML file with keys of a description's `payload` only; raises ConfigError.
 
     Raises:
         UsageError: no such file.
@@ -231,7 +232,7 @@ class KnownKeys:
         return next((str(one["description"]) for one in self._at(where, value) if "description" in one), "")
 
     def unit(self, where: Sequence[str | int], value: Any) -> str:
-        """Return the schema's unit of a key or, for an item of a list, of the key above it; empty for none."""
+        """Return the schema's unit of a key (of a list's item: the list's); empty for none. `value`: the whole file."""
         for length in range(len(where), 0, -1):
             if found := next((str(one["x-unit"]) for one in self._at(where[:length], value) if "x-unit" in one), ""):
                 return "" if found == "1" else found

@@ -44,7 +44,7 @@ class MotorLimits:
         return np.asarray(np.abs(torque @ self.to_motors.T) / self.torque)
 
     def used_of_joints(self, torque: Vector) -> Vector:
-        """Return per joint the largest share of its limit among motors that move the joint, shape (..., joints)."""
+        """Return per joint the largest `used` share of motors coupled with it, even indirectly, shape (..., joints)."""
         shares = np.where(self.together, self.used(torque)[..., None, :], 0.0)
         return np.asarray(shares.max(axis=-1))
 
@@ -89,7 +89,7 @@ class MotionLimits:
 
 
 def motor_limits(config: ArmConfig) -> MotorLimits | None:
-    """Return the torque limits of motors that share joints; None if no two share one, or no motor's limit is known.
+    """Return all motors' torque limits if some are coupled through joints; None if none are, or no limit is known.
 
     Limits are those of `transmission.motor_torque` or of the drives, whichever is smaller.
     """

@@ -117,7 +117,7 @@ def counts(block: ExactBlock) -> list[int]:
 def prove(
     statement: Statement, multipliers: Sequence[Array], y: Array
 ) -> tuple[list[list[Fraction]], list[Fraction]] | None:
-    """Round multipliers to fractions that prove infeasibility exactly; return those of blocks and rows, or None.
+    """Round multipliers to fractions that prove infeasibility exactly, of blocks and rows; None if rounding breaks it.
 
     With them no body has the parameters: the multipliers' value is negative, or zero with one not zero.
 

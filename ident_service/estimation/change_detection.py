@@ -222,7 +222,7 @@ class ParameterChange:
 
     @cached_property
     def changes(self) -> tuple[Effect, ...]:
-        """Return the effects that have changed, the largest change of torque first."""
+        """Return the effects that have changed, sorted by change of torque over residual, the largest first."""
         found = [effect for effect in self.effects if effect.changed]
         return tuple(sorted(found, key=lambda effect: (-(effect.residual_share or 0.0), effect.p)))
 
@@ -298,14 +298,14 @@ def torque_shares(first: ComparedEstimate, second: ComparedEstimate, difference:
 
 
 def relevant(shares: tuple[Array, Array] | None) -> bool:
-    """Return whether a joint's torque changes by at least 1 % of its torque, 25 % of its residual; True for None."""
+    """Return whether some joint's torque changes by at least 1 % of it and 25 % of its residual; True for None."""
     if shares is None:
         return True
     return bool(np.any((shares[0] >= RELEVANT_TORQUE) & (shares[1] >= RELEVANT_RESIDUAL)))
 
 
 def parameter_groups(leading: Sequence[str]) -> dict[tuple[Kind, int], tuple[int, ...]]:
-    """Return the indices of the parameters of each physical effect, by (kind, number of the joint or link from 1).
+    """Group base parameters by the (kind, joint or link number from 1) of their `leading` names; return their indices.
 
     Args:
         leading: the link parameter that each base parameter is named after.
@@ -318,7 +318,7 @@ def parameter_groups(leading: Sequence[str]) -> dict[tuple[Kind, int], tuple[int
 
 
 def difference_test(first: ComparedEstimate, second: ComparedEstimate, places: Sequence[int]) -> Test:
-    """Test (T^2) whether these base parameters differ between two identifications; the result has the p-value.
+    """Test (T^2) whether base parameters at `places` differ between two identifications; p is 1 if none is known.
 
     Args:
         first: one set.
@@ -404,7 +404,10 @@ class Cause:
 
 
 def causes(difference: Array, K: Array, names: Sequence[str], motion: Motion) -> list[Cause]:
-    """Return each body, friction or drive inertia that alone could explain a torque difference, best first.
+    """Return how much of a torque difference each body, friction or drive inertia alone explains, likeliest first.
+
+    The first is the simplest of those that explain nearly the most, the others follow by what they explain. What has no
+    torque on this motion is left out.
 
     Args:
         difference: difference of base parameters, SI units, shape (base,).
@@ -437,7 +440,7 @@ def causes(difference: Array, K: Array, names: Sequence[str], motion: Motion) ->
 
 
 def meaning_of_cause(cause: Cause, links: int) -> str:
-    """Return a sentence for people on what a cause may mean: by its kind, its sign, and if it is the last link.
+    """Return a lower-case phrase on what a cause may mean, from a table: by kind, friction's sign, last link.
 
     Args:
         cause: to explain.
@@ -449,7 +452,7 @@ def meaning_of_cause(cause: Cause, links: int) -> str:
 
 
 def meaning_of_effect(effect: Effect, found: ParameterChange, leading: Sequence[str], links: int) -> str:
-    """Return a sentence for people on what a changed effect may mean at the arm, by its kind, sign and link."""
+    """Return a lower-case phrase on what an effect may mean, from a table: by kind, friction's sign, last link."""
     if effect.kind == "friction":
         return _MEANINGS[_direction({leading[place]: float(found.difference[place]) for place in effect.places})]
     return _MEANINGS["last" if effect.number == links and effect.kind != "drive inertia" else effect.kind]

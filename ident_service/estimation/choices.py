@@ -56,7 +56,7 @@ def best_choice(option: str, held_out: Mapping[str, float]) -> Choice:
 
 
 def significant_choice(option: str, held_out: Mapping[str, Array]) -> Choice:
-    """Choose the first alternative, unless another predicts every third clearly better; then the smallest error.
+    """Choose the first alternative, or of those that beat it clearly, on every third, the one of the smallest error.
 
     Args:
         option: key in the configuration's section `identification`.

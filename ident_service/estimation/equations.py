@@ -94,7 +94,7 @@ class Equations:
 
     @cached_property
     def clusters(self) -> tuple[tuple[Information, ...], ...]:
-        """Return the blocks grouped by motion: repetitions of one motion are one group, in the order first seen.
+        """Return the blocks grouped by label: found repeats of one motion are one group, in the order first seen.
 
         What the model lacks errs by the same torque in all blocks of a cluster: they are no independent evidence.
         """
@@ -157,7 +157,7 @@ def equations(
         judging: whether only errors are computed from them, for which no joint has to move.
 
     Raises:
-        RecordingError: a recording does not fit the arm, or some joint moves in none of them.
+        RecordingError: a recording does not fit the arm or, unless `judging`, some joint moves in none of them.
     """
     whole = tuple(recordings) if isinstance(recordings, Sequence) else (recordings,)
     felt = sparsity(model.chain, model.layout, base.base)
@@ -175,18 +175,19 @@ def equations_of(
     *,
     judging: bool = False,
 ) -> Equations:
-    """Compress the rows that `rows_of` yields for each recording into blocks of time; further columns are allowed.
+    """Compress the rows of `rows_of` into blocks of time; raises if a joint never moves, unless `judging`.
 
     Args:
         recordings: to read.
         model: model whose configuration says how to cut the recordings into blocks.
         felt: per joint, which columns it feels, increasing.
-        rows_of: function that yields a recording's rows in consecutive chunks.
+        rows_of: function that yields a recording's rows in consecutive chunks; they may have further columns than those
+            of base parameters.
         row_weights: function that returns the factors of the rows, as for `equations`.
         judging: as for `equations`.
 
     Raises:
-        RecordingError: a recording does not fit the arm, or some joint moves in none of them.
+        RecordingError: a recording does not fit the arm or, unless `judging`, some joint moves in none of them.
     """
     gathered, moved = Equations((), 0), np.zeros(model.chain.joints, dtype=np.bool_)
     for recording, cut in zip(recordings, cut_into_stretches(recordings, model), strict=True):
@@ -253,7 +254,7 @@ def _question_of_unit(recordings: Sequence[Recording], model: ArmModel, still: S
 
 
 def cut_into_stretches(recordings: Sequence[Recording], model: ArmModel) -> tuple[Stretches, ...]:
-    """Return for each recording its division into time stretches, labelled so that repeats of a motion share a label.
+    """Divide recordings into labelled stretches of time; repeats of a motion share a label, unless `period` is set.
 
     Raises:
         RecordingError: a recording cannot be read.
@@ -360,7 +361,7 @@ def motors_of_torques(model: ArmModel) -> Array:
 
 
 def known_torque(recording: Recording, model: ArmModel, base: BaseParameters, rows: Rows) -> Array | None:
-    """Return the torque of a recording's known payload [N m or N], shape (samples, joints); None without one.
+    """Return a known payload's torque [N m or N], shape (samples, joints); None without one, or if `rows` lack columns.
 
     Args:
         recording: recording of the rows.

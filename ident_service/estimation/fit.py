@@ -224,7 +224,7 @@ def unconstrained(
     base: BaseParameters,
     conditions: FeasibleSet,
 ) -> Fit:
-    """Estimate without conditions by a method; `choose` is `wls` or `huber`, by error on held-out thirds.
+    """Estimate base parameters without conditions; method `choose` takes `wls` or `huber` by error on held-out thirds.
 
     The covariance has the doubt about the friction's shape and the torque constants in it, where those were fitted.
 
@@ -313,7 +313,7 @@ def _fit_with_uncertainty(method: Method, fit: LeastSquares, equations: Equation
 
 
 def allowed_change(fit: LeastSquares, base: BaseParameters, deviations: Array, beta: Array) -> ChangeEllipsoid | None:
-    """Return the ellipsoid of base-parameter changes of 1 % of their deviations; None where none is known.
+    """Return the ellipsoid of changes within 1 % of the deviations, friction fixed; None where no deviation is known.
 
     In the metric of eq. 81 a change of length 1 moves each parameter by at most its white deviation, which is no
     larger than the one that is told; so no torque changes by what could be seen. Friction does not move.

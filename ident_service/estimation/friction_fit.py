@@ -267,7 +267,7 @@ class FrictionTrials:
 
     @one_blas_thread()
     def delayed_rows(self, stribeck_velocity: Array) -> Callable[[float], tuple[Information, ...]]:
-        """Return a function of the torque's delay [s] that returns the rows in motion, per third.
+        """Return a function from the torque's delay [s] to the equations of rows in motion, one `Information` a third.
 
         The torque between its samples is that of its first two derivatives: good for delays that are short beside the
         period of the filter's cut-off. Where a joint turns round friction looks like a delay; those rows are left out.
@@ -461,7 +461,7 @@ def friction_trials(recordings: Sequence[Recording], model: ArmModel, base: Base
 
 
 def fitted_friction_parameters(model: ArmModel) -> tuple[str, ...]:
-    """Return which of `presliding` and `stribeck_velocity` are to be fitted and in this arm's friction terms."""
+    """Return which of `presliding` and `stribeck_velocity` are left to `fit` and matter to the arm's friction terms."""
     shape, terms = model.config.identification.friction, set(model.layout.terms)
     if not {"coulomb", "stribeck"} & terms:
         return ()
@@ -471,7 +471,7 @@ def fitted_friction_parameters(model: ArmModel) -> tuple[str, ...]:
 
 
 def searched(key: str) -> float:
-    """Return the standard deviation of a number's logarithm, if uniform over the range that is searched."""
+    """Return the standard deviation of the log of friction number `key`, were it uniform over its search range."""
     grid = _GRIDS[key][_GRIDS[key] > 0.0]
     return float(np.log(grid[-1] / grid[0]) / np.sqrt(12.0))
 
@@ -479,7 +479,7 @@ def searched(key: str) -> float:
 def fit_friction(
     trials: FrictionTrials | None, model: ArmModel, base: BaseParameters, conditions: FeasibleSet | None = None
 ) -> tuple[ArmModel, tuple[Choice, ...]]:
-    """Fit the friction numbers left to `fit`; return the arm with them, and per kind whether it was fitted or left out.
+    """Fit friction numbers left to `fit`; return the arm with them and, given `conditions`, each kind's choice.
 
     Args:
         trials: rows of the fitted recordings; None where nothing is to be fitted.

@@ -92,7 +92,7 @@ def instrumental_variables(
     fit: LeastSquares,
     delta: Array,
 ) -> InstrumentalEstimate:
-    """Refine an estimate by repeated simulation of noise-free motions as instruments, until it settles (IDIM-IV).
+    """Refine an estimate in rounds with simulated noise-free motions as instruments (IDIM-IV); return the most settled.
 
     Args:
         recordings: recordings that `fit` was fitted to.

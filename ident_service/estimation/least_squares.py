@@ -58,7 +58,7 @@ class LeastSquares:
 
 
 def weighted_least_squares(information: Information) -> LeastSquares:
-    """Solve least squares with each joint divided by its residual's deviation, repeated until the weights settle.
+    """Solve least squares with each joint divided by its residual's deviation, until weights settle, else ModelError.
 
     Raises:
         ModelError: the weights do not settle, which means that some joint's residual vanishes.
@@ -149,7 +149,7 @@ def _solution(information: Information, weights: Array | None) -> _Solution:
 
 
 def unit_columns(matrix: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the columns' lengths (1 for columns that are only rounding), and a mask of the columns that are not.
+    """Return the columns' lengths, 1 for columns that are only rounding, and a mask of the other columns.
 
     The Stribeck column of rows that are all fast underflows; divided by its length it would be rounding of unit length.
     """

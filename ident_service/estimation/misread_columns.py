@@ -193,7 +193,7 @@ class MisreadColumns:
 
 @one_blas_thread()
 def misread_columns(estimate: Estimate, recordings: Sequence[Recording]) -> MisreadColumns | None:
-    """Return the reading of the columns that predicts torques far better than the recorded one; None if none does.
+    """Return the reading (sign, order, scale, zero, time) that predicts far better; None if none, or errors are small.
 
     Nothing is tried where every joint's torque is predicted to a tenth, and all of them together to 4 %. Of the
     recordings at most a minute is fitted.

@@ -85,7 +85,7 @@ class Essential:
 def essential_parameters(
     equations: Equations, fit: LeastSquares, *, level: float = 0.05, covariance: Array | None = None
 ) -> Essential:
-    """Remove base parameters that the data do not need, one by one, until an F-test refuses; return those left.
+    """Remove base parameters that data do not need until an F-test refuses; return the rest; raises if any is unseen.
 
     Args:
         equations: equations that `fit` solves.
@@ -145,7 +145,7 @@ def essential_parameters(
 
 
 def effective_samples(fit: LeastSquares, covariance: Array, rows: int) -> float:
-    """Return the number of independent rows with the estimate's uncertainty, at least one more than parameters.
+    """Return how many independent rows would give the estimate's uncertainty, at least one more than parameters.
 
     Args:
         fit: the estimate, with its white standard deviations (eq. 81).

@@ -162,7 +162,7 @@ class Payload:
     excess: Array | None = None
 
     def far(self) -> tuple[int, ...]:
-        """Return the indices of joints whose residual is far above the identification's and more than 1 % of torque."""
+        """Return indices of joints whose residual is over 1 % of torque and 4 times a known identification's."""
         if self.excess is None:
             return ()
         matters = self.fitted.joint_relative_percent > 100.0 * RELEVANT_TORQUE
@@ -385,7 +385,7 @@ def _metric(covariance: Array) -> Array:
 
 
 def body_words(payload: Payload) -> tuple[str, ...]:
-    """Return per value of the ten of a body its verdict, or `chosen` where the motion does not determine it.
+    """Return a verdict for each of the payload's ten parameters: `chosen` where the motion does not determine it.
 
     A value that several base parameters make up has the worst of their verdicts.
     """

@@ -76,7 +76,7 @@ class Objections:
 
 
 def reasons_against(estimate: Estimate, recordings: Sequence[Recording] = ()) -> tuple[str, ...]:
-    """Return sentences on why an estimate cannot be right, judged by its torque errors; empty where nothing is.
+    """Return sentences on why an estimate cannot be right, judged by its torque errors; empty where no reason is found.
 
     The words name the most likely cause where the numbers tell one.
 
@@ -100,7 +100,7 @@ def reasons_against(estimate: Estimate, recordings: Sequence[Recording] = ()) ->
 
 
 def reasons_in_length(estimate: Estimate, seconds: float) -> tuple[str, ...]:
-    """Return a sentence (or none) on why a motion under a minimum length leaves too much unidentified.
+    """Return a sentence if a motion is short and leaves too much unidentified; () if not, or if others validate it.
 
     A short motion that leaves much unidentified predicts itself and nothing else. Where other recordings validate the
     estimate, their errors judge it.

@@ -52,7 +52,7 @@ def huber(
     shares: Array | None = None,
     spread: SpreadRows | None = None,
 ) -> tuple[LeastSquares, Equations, float]:
-    """Return Huber's estimate, the reweighted equations that it solves, and how much its last round changed it.
+    """Return Huber's estimate of the round that changed least, its reweighted equations, and that change [deviations].
 
     The change is in standard deviations. Where the weights do not settle in the rounds that there are, the one that
     changed least is the answer: a change above `SETTLED` says so.
@@ -85,7 +85,7 @@ def huber(
 
 
 def held_out_errors(spread: SpreadRows, start: LeastSquares) -> dict[str, float]:
-    """Return the torque error [percent] of `wls` and `huber` on each third predicted from the others, by name.
+    """Return the torque error [percent] of `wls` and `huber`, by name, over thirds, each predicted from the others.
 
     Args:
         spread: rows of the recordings that are fitted to.
@@ -181,7 +181,7 @@ class SpreadRows:
 def spread_rows(
     recordings: Sequence[Recording], model: ArmModel, base: BaseParameters, times: Array, shares: Array
 ) -> SpreadRows:
-    """Read every recording once; return its rows, torques times `times`; of long ones every 2nd, 4th ... sample.
+    """Read recordings once; return their rows, torques times `times`, thinned to every 2nd, 4th ... sample if many.
 
     Raises:
         RecordingError: a recording cannot be used.

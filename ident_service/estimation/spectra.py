@@ -52,7 +52,7 @@ class Spectrum:
 
     @property
     def cutoff(self) -> float:
-        """Return the cut-off [Hz] between the end of the motion's spectrum and the beginning of noise."""
+        """Return the filter's cut-off [Hz]: above the motion's spectrum and, where there is room, below the noise."""
         wanted = max(_MARGIN * self.motion, USUAL)
         return min(wanted, max(self.noise, _LEAST_MARGIN * self.motion), _HIGHEST * self.rate)
 
@@ -94,7 +94,7 @@ def with_chosen_cutoff(model: ArmModel, recordings: Sequence[Recording]) -> ArmM
 
 
 def remarks_on_noise(recordings: Sequence[Recording], model: ArmModel) -> tuple[str, ...]:
-    """Return a remark per recording in which position noise passes the filter and biases least squares.
+    """Return a remark per recording whose position noise passes the filter; none where periods are averaged.
 
     Args:
         recordings: fitted recordings.

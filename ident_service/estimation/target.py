@@ -39,7 +39,7 @@ class Target:
     parameters: tuple[str, ...] = ()
 
     def places(self, base: BaseParameters, arm: str) -> NDArray[np.intp]:
-        """Return the indices of the base parameters that the target names, all if it names none, shape (chosen,).
+        """Return the indices of base parameters that the target names, all if none; raises UsageError for unknown ones.
 
         Raises:
             UsageError: one is none of the arm's.

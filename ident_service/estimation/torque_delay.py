@@ -55,7 +55,7 @@ def with_delay(model: ArmModel, seconds: float) -> ArmModel:
 
 
 def estimate_delay(recordings: Sequence[Recording], model: ArmModel, base: BaseParameters) -> Delay:
-    """Return the delay of torque behind position [s] and its deviation, one for all recordings.
+    """Return torque's delay behind position [s] in all recordings, and its deviation; RecordingError if none explains.
 
     Args:
         recordings: of one arm through one chain of measurement.
@@ -90,7 +90,7 @@ def estimate_delay(recordings: Sequence[Recording], model: ArmModel, base: BaseP
 def choose_delay(
     trials_at: Callable[[float], FrictionTrials], period: float, base: BaseParameters, conditions: FeasibleSet
 ) -> tuple[float, Choice | None]:
-    """Return the delay [s] with the smallest held-out error, 0.0 unless one is clearly better; and how it was chosen.
+    """Return the delay [s] of least held-out error, 0.0 unless one is clearly better, and the choice or None.
 
     It is searched for within a few samples, and further on about the largest of them while that one is clearly better.
 

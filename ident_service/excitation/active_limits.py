@@ -56,7 +56,7 @@ class ActiveLimit:
 
 
 def binding(task: Task, coefficients: Array, per_period: int) -> tuple[ActiveLimit, ...]:
-    """Return the limits that a motion reaches, each with what relaxing it would gain; the largest gain first.
+    """Return the limits that a motion reaches and whose relaxing would gain something; the largest gain first.
 
     Args:
         task: task of the search.
@@ -117,7 +117,7 @@ def active_limit_lines(
     lengths: Sequence[str],
     gains: Mapping[int, str] | None = None,
 ) -> list[str]:
-    """Return lines for people: which limits hold a motion back, what they cost, and which gains would lift them.
+    """Return lines for people: the limits that hold a motion back, what relaxing each gains, and stiffer kp and kd.
 
     Args:
         found: the limits.
@@ -160,7 +160,7 @@ def stiffer_gains(
     limits: MotionLimits,
     stable: Callable[[Array, Array], bool],
 ) -> dict[int, str]:
-    """Return sentences, by joint index, on stiffer kp and kd where following holds back, stable all together.
+    """Return phrases, by joint index, on stiffer kp and kd where following holds back, stable all together.
 
     Args:
         found: the limits.

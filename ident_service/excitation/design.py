@@ -437,7 +437,7 @@ def design_motion(
     tell: Callable[[Progress], None] = lambda _: None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> Designed:
-    """Return the most informative motion that a search within a budget finds, proven to keep every limit.
+    """Return the most informative motion that a search finds, proven to keep all limits; raises MotionRefused if none.
 
     Args:
         model: of the arm, with prior parameters.
@@ -572,7 +572,7 @@ def _scaling_text(task: Task, base: BaseParameters, attempt: Attempt) -> str:
 
 
 def require_known_inertia(model: ArmModel, task: Task, safe: Array) -> None:
-    """Raise MotionRefused where a joint without described drive inertia would lag far at its velocity limit.
+    """Given a prior, raise MotionRefused where a joint without drive inertia would lag far at its velocity limit.
 
     The law's stiffness is kp times the inertia that it knows, behind a wrist next to none; and the arm itself, which
     has more, is simulated with as little. What such a motion comes to is chance.

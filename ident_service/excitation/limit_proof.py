@@ -123,7 +123,7 @@ class PeakBounds:
     motors: Array | None = None
 
     def violations(self, names: tuple[str, ...], limits: MotionLimits, supply: Supply | None = None) -> list[str]:
-        """Return a sentence for each limit that a bound exceeds; empty where none does. NaN counts as beyond."""
+        """Return a sentence for each limit that a bound exceeds (NaN does too); bounds that are None are not judged."""
         # Negated comparisons, so that a bound that is NaN counts as beyond every limit.
         found = []
         for k, name in enumerate(names):
@@ -141,7 +141,7 @@ class PeakBounds:
     def torque_and_power_violations(
         self, names: tuple[str, ...], limits: MotionLimits, supply: Supply | None = None
     ) -> list[str]:
-        """Return a sentence for each exceeded limit of joint torque, motor torque or supply power; empty for none."""
+        """Return a sentence for each limit that a known bound of joint torque, motor torque or power exceeds."""
         found = []
         if self.torque is not None:
             rows = zip(names, self.torque, limits.torque, strict=True)
@@ -155,7 +155,7 @@ class PeakBounds:
 
 
 def demands(path: Path, model: ArmModel) -> PeakBounds:
-    """Bound position, velocity, acceleration, jerk, torque and power of a motion over all time.
+    """Bound a motion's position to jerk over all time and, given a prior, torque and (with a supply) power; else None.
 
     Args:
         path: the motion.
@@ -232,7 +232,7 @@ def _drive_rates(velocity: list[TaylorModel], coupling: Array) -> list[TaylorMod
 
 
 def power_bounds(torque: list[TaylorModel], velocity: list[TaylorModel], supply: Supply, coupling: Array) -> Array:
-    """Return the largest power drawn from the supply [W] in each time interval, shape (stretches,).
+    """Return an upper bound of the power drawn from the supply [W] in each time interval, shape (stretches,).
 
     Torque and velocity of the joints are handed to the drives that move them, `tau_drive = C^-T tau`.
     """
@@ -426,7 +426,7 @@ def proof_of(
     collision: CollisionModel,
     torque_margin: float | None = None,
 ) -> Proof:
-    """Bound a motion and its ways from and to home; simulate the arm too where these are proven to keep limits.
+    """Bound a motion and its ways from and to home; if they keep limits and a prior is known, simulate the arm too.
 
     Args:
         path: the motion.
@@ -467,7 +467,11 @@ def _approach_paths(path: FourierPath | PosturePath, limits: MotionLimits) -> Po
 
 
 def violations(proof: Proof, model: ArmModel, limits: MotionLimits) -> list[str]:
-    """Return a sentence for each limit that is not proven to be kept; empty where all are."""
+    """Return a sentence for each limit that a bound of the proof exceeds; what was not computed is not judged.
+
+    The least clearance is that of the model's configuration. Torque is not computed without a prior, clearance not
+    without geometry.
+    """
     found = proof.demands.violations(model.chain.names, limits, model.config.supply)
     forces = proof.ways.torque_and_power_violations(model.chain.names, limits, model.config.supply)
     found += [f"at home, or on the way from it or back: {one}" for one in forces]
@@ -484,7 +488,7 @@ def violations(proof: Proof, model: ArmModel, limits: MotionLimits) -> list[str]
 
 
 def tightened(task: Task, proof: Proof, limits: MotionLimits) -> Task | None:
-    """Return a task that keeps free what a proof found missing; None where nothing changes or it is too much.
+    """Return a task that keeps free what a proof found missing; None if nothing is, or over 0.2 m of clearance.
 
     The search forecasts friction alone. The simulated arm also has heavier links, and takes its time to settle, and the
     tube around its motion is as wide as its worst joint makes it.

@@ -327,7 +327,7 @@ class Problem:
         return tuple(zip(self._maps, middles, sizes, strict=True))
 
     def speed_from_error(self, x: Array) -> Array:
-        """Return the share of its allowed speed that catching up adds, negative if it takes off, (samples, joints)."""
+        """Return the speed that catching up adds, as share of the allowed; negative if it slows; (samples, joints)."""
         q, dq = (values @ self.coefficients(x).T for values in self._maps[:2])
         if self._following is None:
             return np.zeros_like(q)

@@ -106,7 +106,7 @@ class Tracking:
         return found
 
     def width(self, time: Array, half: Array) -> Array:
-        """Return the largest distance of the arm from its reference [rad or m], shape (cells, joints).
+        """Return the simulated arm's largest distance from its reference, widened [rad or m], shape (cells, joints).
 
         Args:
             time: middles of cells of time in the motion [s], shape (cells,).
@@ -122,9 +122,9 @@ class Tracking:
         return np.asarray(_WIDENED * width)
 
 
-def cases(margin: float) -> tuple[Case, ...]:
-    """Return the two cases to simulate: less friction; more friction with links heavier by the torque margin."""
-    heavier = 1.0 + margin
+def cases(torque_margin: float) -> tuple[Case, ...]:
+    """Return the cases to simulate: 1.4 times the friction with links heavier by the margin; 0.6 times the friction."""
+    heavier = 1.0 + torque_margin
     down, up = DOUBT
     return (
         Case(f"{up:g} times the expected friction and links {heavier:g} times as heavy", up, heavier),
@@ -132,15 +132,15 @@ def cases(margin: float) -> tuple[Case, ...]:
     )
 
 
-def track(path: Path, model: ArmModel, margin: float) -> Tracking:
-    """Simulate the controlled arm over a motion with less and more friction; return its largest errors and speeds.
+def track(path: Path, model: ArmModel, torque_margin: float) -> Tracking:
+    """Simulate the arm over a motion with less friction, and with more and heavier links; return errors and speeds.
 
     Of a periodic motion both ramps and one period are simulated, which the others repeat.
 
     Args:
-        path: the motion.
+        path: the motion, a reference of the joints over time.
         model: of the arm, with prior parameters.
-        margin: share of every torque limit that the motion keeps free.
+        torque_margin: share of every torque limit that the motion keeps free, by which links are heavier in one case.
 
     Raises:
         ModelError: no prior, or one that no real body has.
@@ -157,7 +157,7 @@ def track(path: Path, model: ArmModel, margin: float) -> Tracking:
     tube = np.zeros((stretches, once.joints))
     error, worst = np.zeros(once.joints), ""
     velocity, beyond = np.zeros(once.joints), np.full(once.joints, -np.inf)
-    for case in cases(margin):
+    for case in cases(torque_margin):
         position, rate = _followed(case, model, limits, period, reference)
         away = np.abs(reference[0] - position)
         np.maximum.at(tube, place, away)
@@ -173,7 +173,7 @@ def track(path: Path, model: ArmModel, margin: float) -> Tracking:
     return Tracking(error, velocity, beyond, worst, tube, repeated, from_)
 
 
-def segment_tube_width(path: Path, model: ArmModel, margin: float) -> Callable[[Array, Array], Array]:
+def segment_tube_width(path: Path, model: ArmModel, torque_margin: float) -> Callable[[Array, Array], Array]:
     """Simulate the arm over slow segments; return the function of its largest distance from the reference.
 
     Long segments are simulated in parts, whose largest error then counts throughout.
@@ -184,7 +184,7 @@ def segment_tube_width(path: Path, model: ArmModel, margin: float) -> Callable[[
     Args:
         path: the segments.
         model: of the arm, with prior parameters.
-        margin: margin, as for `track`.
+        torque_margin: as for `track`.
 
     Returns:
         A function of times and half widths [s], as `Tracking.width`.
@@ -196,7 +196,7 @@ def segment_tube_width(path: Path, model: ArmModel, margin: float) -> Callable[[
     period = 1.0 / model.config.control.rate
     part = _SETTLES / float(np.sqrt(limits.kp.min()))
     if path.duration <= max(_WHOLE, _PARTS * part):
-        return track(path, model, margin).width
+        return track(path, model, torque_margin).width
     times = period * np.arange(int(np.ceil(part / period)) + 1)
     used = control_model(model)
     if used.prior is None:
@@ -208,7 +208,7 @@ def segment_tube_width(path: Path, model: ArmModel, margin: float) -> Callable[[
     for begin in np.linspace(0.0, path.duration - part, _PARTS):
         reference = path.at(np.minimum(begin + times, path.duration))[:3]
         stuck = np.maximum(stuck, np.abs(np.linalg.inv(law.mass_matrix(reference[0][0]))) @ dry / limits.kp)
-        for case in cases(margin):
+        for case in cases(torque_margin):
             away = np.abs(reference[0] - _followed(case, model, limits, period, reference)[0])
             error = np.maximum(error, away.max(axis=0))
     width = _WIDENED * (error + stuck)

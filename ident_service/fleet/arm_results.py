@@ -131,22 +131,22 @@ class Branches:
 
     @cached_property
     def single(self) -> Merged:
-        """Return the information of the first recording, read from the store."""
+        """Return the first recording's information from the store; raises MissingFactors where it is gone."""
         return _merged(self.leaves.keys[:1], self.described, self.store, whole=False)
 
     @cached_property
     def trained(self) -> Merged:
-        """Return the merged information of the recordings that are not held out."""
+        """Return the merged information of the recordings not held out; raises MissingFactors where one is gone."""
         return self._branch(0, self.leaves.keys[: self.leaves.count])
 
     @cached_property
     def held(self) -> Merged:
-        """Return the merged information of the recordings that are held out."""
+        """Return the merged information of the recordings held out; raises MissingFactors where one is gone."""
         return self._branch(1, self.leaves.keys[self.leaves.count :])
 
     @cached_property
     def merged(self) -> Merged:
-        """Return the merged information of all recordings."""
+        """Return the merged information of all recordings; raises MissingFactors where one is gone."""
         if self.leaves.count == len(self.leaves.keys):
             return self.trained
         found = merge([self.trained, self.held])
@@ -333,7 +333,7 @@ def arm_files(
     store: Store,
     shown: ArmShown,
 ) -> tuple[Files, dict[str, Any]]:
-    """Build one arm's result files, by name, and the summary of its estimate for the fleet; write nothing.
+    """Build one arm's result files, by name, and its summary; the estimate is read from the store, or kept there.
 
     Args:
         fits: of the arm.
@@ -364,7 +364,7 @@ def side_files(
     more: dict[str, Any],
     store: Store,
 ) -> Files:
-    """Build the result files of some recordings of an arm, such as those before or after a change; write none.
+    """Build the result files of some recordings, by name; the estimate is read from the store, or kept there.
 
     Args:
         keys: keys of the recordings' factors, in the order in which they are merged.

@@ -329,7 +329,7 @@ def trimmed(task: Callable[_Given, _Found]) -> Callable[_Given, _Found]:
 
 
 def give_back() -> None:
-    """Return unused heap memory of this process to the system (`malloc_trim`); does nothing where that is unknown."""
+    """Return unused heap memory to the system, if glibc; the first use also makes glibc keep freed memory later on."""
     if (trim := _malloc_trim()) is not None:
         trim(0)
 
@@ -399,7 +399,7 @@ def settle(sources: Sequence[Source], description: str) -> Settled | tuple[Probl
 @trimmed
 @one_blas_thread()
 def reduce_recording(part: Part, described: Described, store: Store, version: str, again: bool = False) -> Outcome:
-    """Reduce a recording, or a piece, to a factor and its row in the store, unless there; a failure is returned.
+    """Reduce a recording or piece to factor and row in the store, unless there; return row or what is wrong with it.
 
     Args:
         part: to reduce.

@@ -599,7 +599,7 @@ class HeldOut:
 
     @property
     def gain(self) -> float:
-        """Return the relative reduction of the held-out error by pooling, 0.1 for 10 %; negative where it grows."""
+        """Return the cut in held-out error by pooling, 0.1 for 10 %, negative where it grows; NaN if none is known."""
         alone, pooled = self.totals
         return 1.0 - pooled / alone if alone > 0.0 else np.nan
 

@@ -139,7 +139,7 @@ class Reduced:
 
 @contextmanager
 def connected(request: FleetRequest, tell: Tell) -> Iterator[Client]:
-    """Yield a Dask client of the given scheduler, or of one started here; raises if workers do not fit.
+    """Yield a Dask client of the given scheduler, or of workers started here; raises if none, or of another version.
 
     Raises:
         Unavailable: no scheduler answers there, or it has no worker.
@@ -328,7 +328,7 @@ def reduce_fleet(
     tell: Tell,
     step: Step = lambda words, share: None,
 ) -> Reduced:
-    """Reduce every recording of a fleet on the workers to its factor and row in the store; return them by arm.
+    """Reduce a fleet's recordings on workers to factors and rows in the store; return the rows by arm, and problems.
 
     Args:
         client: of the scheduler.
@@ -512,7 +512,7 @@ def reduce_again(client: Client, reduced: Reduced, keys: Collection[str], store:
 def merged_on_workers(
     client: Client, keys: Sequence[str], described: Described, store: Store, *, whole: bool
 ) -> Future | None:
-    """Start tasks that merge factors in a tree and return the last one's future; None for factors that are few.
+    """Start tasks that merge factors in a tree; return the last one's future. Start none, return None, for few.
 
     Few enough are merged by the task that needs them.
 
@@ -535,7 +535,7 @@ def merged_on_workers(
 
 
 def status_of(request: FleetRequest) -> Mapping[str, Any]:
-    """Return counts and bytes of the store's factors, and per arm how many recordings are reduced; compute nothing.
+    """Return counts and bytes of the store's factors and, given patterns, how many recordings per arm are reduced.
 
     Raises:
         UsageError, ConfigError: the request or the description is not valid.

@@ -67,7 +67,7 @@ def _system(url: str) -> tuple[Any, str]:
 
 
 def persistently(action: Callable[[], _Result], url: str, pauses: Sequence[float] = PAUSES) -> _Result:
-    """Call a function that uses storage, again after pauses for transient errors; return its result.
+    """Call a function that uses storage, again after pauses for transient errors; return its result or raise.
 
     Args:
         action: function to call; it can be repeated.
@@ -95,7 +95,7 @@ def persistently(action: Callable[[], _Result], url: str, pauses: Sequence[float
 
 
 def find(patterns: Sequence[str]) -> list[Source]:
-    """Return the files that patterns name (files, globs, whole folders), sorted by URL, each once.
+    """Return the files that patterns name (files, globs, folders), by URL, each once; UsageError if one names none.
 
     Raises:
         UsageError: a pattern names nothing, or storage that is not known.

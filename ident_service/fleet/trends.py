@@ -128,7 +128,12 @@ def _estimates(recordings: Sequence[Recorded], number: int, places: Sequence[int
 
 @one_blas_thread()
 def scatter_of(arms: Mapping[str, Sequence[Recorded]], groups: Mapping[Group, Sequence[int]]) -> dict[Group, Scatter]:
-    """Estimate per group how much an arm's recordings scatter, from neighbours in time of all arms."""
+    """Estimate each group's scatter between an arm's recordings from neighbours in time; zero without neighbours.
+
+    Args:
+        arms: recordings of each arm, by time.
+        groups: indices of each group's parameters, in the order of `row.covariances`.
+    """
     found = {}
     for number, (group, places) in enumerate(groups.items()):
         steps: list[Array] = []
@@ -172,7 +177,7 @@ def change_points(
     groups: Mapping[Group, Sequence[int]],
     scatter: Mapping[Group, Scatter],
 ) -> list[Change]:
-    """Find per arm and group the most likely change over time; return all, tested with Holm's correction.
+    """Find each arm's likeliest change over time per group with enough recordings; return all, p Holm-corrected.
 
     Args:
         arms: recordings of each arm, by time.
@@ -341,7 +346,7 @@ class Compared:
 
     @property
     def changed(self) -> list[Change]:
-        """Return the changes over time that are significant and matter."""
+        """Return the changes with p below 0.01 that make at least 1 % of a joint's torque and 25 % of its residual."""
         return [one for one in self.changes if one.changed]
 
     def changes_of(self, arm: str) -> list[Change]:

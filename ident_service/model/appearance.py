@@ -85,7 +85,7 @@ MESHES = frozenset({".stl", ".obj", ".dae", ".glb", ".gltf"})
 
 
 def visual_meshes(file: Path, kinematics: Kinematics, chain: Chain) -> list[Mesh]:
-    """Return the triangle meshes of a URDF's visual elements, placed in their joints' frames.
+    """Return the mesh files that a URDF's visual elements name, each with its place in its joint's frame.
 
     Args:
         file: the URDF; meshes are looked for below its folder, those of `package://NAME/...` also without the name.

@@ -279,7 +279,7 @@ def _stays(body: Body) -> bool:
 
 
 def containing_capsule(body: Body) -> Capsule:
-    """Return the body's own capsule, or one that contains its box or cylinder; not for half spaces."""
+    """Return the body's own capsule, or one around its box or cylinder; AssertionError for a half space."""
     solid = body.solid
     if isinstance(solid, Capsule):
         return solid

@@ -343,7 +343,9 @@ class CollisionModel:
 
 
 def share_touching(model: ArmModel, within: float, postures: int, seed: int) -> dict[tuple[str, str], float]:
-    """Return per pair of bodies the share of random postures in which they touch, from 0 to 1; moving link first.
+    """Return per pair that must not touch the share (0 to 1) of random postures with less than `within` [m] between.
+
+    Of each pair the moving link comes first.
 
     Args:
         model: model of an arm, also of one whose bodies always touch.
@@ -491,7 +493,7 @@ class Contact:
         self.clear.setflags(write=False)
 
     def depths(self, position: Array) -> Array:
-        """Return the penetration depth [m] of the pairs checked in this call, positive in overlap; -inf for others.
+        """Return depths [m] of the pairs whose turn it is, positive in overlap; -inf for others, or all if none touch.
 
         Args:
             position: [rad or m], shape (joints,).

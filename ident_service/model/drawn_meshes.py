@@ -27,7 +27,7 @@ _COARSER = 1.5  # the next one
 def joint_triangles(
     urdf: TextFile, kinematics: Kinematics, chain: Chain, folder: Path
 ) -> tuple[dict[int, Array], list[str]]:
-    """Read a URDF's meshes, `visual` else `collision`; return triangles per joint, and why others have none.
+    """Return triangles per joint from a URDF's meshes, and why joints with a part that is no readable mesh have none.
 
     A joint is left out where a part of it has no mesh that can be read: a link without its cover would mislead.
 

@@ -75,7 +75,7 @@ class Information:
         """Raise ModelError unless the other has as many base parameters and joints.
 
         Raises:
-            ModelError: it is.
+            ModelError: it has other numbers of them.
         """
         if self.base != other.base or self.joints != other.joints:
             raise ModelError(

@@ -334,7 +334,7 @@ class BadInertia:
 
 
 def bad_inertias(file: TextFile) -> list[BadInertia]:
-    """Return the links of a URDF with masses or inertias that no real link has, each with its line; empty for none."""
+    """Return each mass of a URDF that is not positive and inertial number that is not finite, with link and line."""
     found: list[BadInertia] = []
     link, inside = "", False
     parser = expat.ParserCreate("utf-8")

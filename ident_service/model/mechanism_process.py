@@ -210,12 +210,12 @@ _UNSUPPORTED = ("JointModelPlanar",)
 
 
 def urdf_document(file: TextFile, part: str | None) -> dict[str, Any]:
-    """Return the arm of a URDF as JSON values; `part` is JSON of `base`, `tip` and `lock`, all of it when None."""
+    """Return the arm of a URDF as JSON values, or an `error`; `part`: JSON of `base`, `tip`, `lock`, None for all."""
     return _document("URDF", lambda: pin.buildModelFromXML(file.text), part or "{}", lambda: mimics(file))
 
 
 def mjcf_document(path: str, part: str | None) -> dict[str, Any]:
-    """Return the arm of an MJCF, alone in its folder, as JSON values; `part` selects it as for a URDF."""
+    """Return the arm of an MJCF, alone in its folder, as JSON values, or its `error`; `part` is as for a URDF."""
     text, unknown = Path(path).read_text(encoding="utf-8-sig"), set[str]()
 
     def build() -> pin.Model:

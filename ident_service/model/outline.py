@@ -532,7 +532,9 @@ def _rounded(start: Array, end: Array, radius: float) -> Capsule:
 
 
 def arm_capsules(outline: Outline, kinematics: Kinematics, chain: Chain) -> tuple[dict[str, list[Capsule]], list[str]]:
-    """Return capsules of the arm's links by joint name or `base`, and names of those with an unreadable mesh.
+    """Return the outline's capsules of each joint (or `base`) that has a mesh, and names of those with an unread one.
+
+    Links without a mesh have none here, as their solids are read from the file; a DH table has none at all.
 
     Args:
         outline: of the file.
@@ -584,7 +586,7 @@ def _around_both(one: Capsule, other: Capsule) -> Capsule:
 
 
 def arm_part(outline: Outline, file: str, base: str | None, tip: str | None) -> dict[str, str]:
-    """Return `base` and `tip` of the arm in a file, where needed: the branch with most joints, up to a gripper.
+    """Return `base` and `tip`, where needed, of a file's arm: the branch with most joints, up to a gripper.
 
     A hand begins where branches part that reach not far, or have too few joints for an arm, or at a joint that others
     mimic. Where a head or a second arm hangs beside an arm, what carries both is no part of it.

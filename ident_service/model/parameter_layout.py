@@ -200,7 +200,7 @@ class JointDrives:
     friction: Array
 
     def of(self, term: JointTerm) -> Array:
-        """Return the values of `drive_inertia`, `viscous` or `coulomb` at each joint, shape (joints,)."""
+        """Return `drive_inertia`, `viscous` or `coulomb` of each joint's own drive, zero if shared, shape (joints,)."""
         return {"drive_inertia": self.armature, "viscous": self.damping, "coulomb": self.friction}[term]
 
 

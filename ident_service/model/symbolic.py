@@ -363,7 +363,7 @@ class TaylorModel:
 
     @property
     def reach(self) -> Array:
-        """Return the largest distance of the value from its middle `c`, over each time interval."""
+        """Return a bound of the value's distance from its middle `c` over each time interval."""
         return np.asarray(np.abs(self.d) * self.h + self.r)
 
     @property

@@ -111,7 +111,7 @@ def first_stamp(recording: Recording) -> int:
 
 
 def time_range(recording: Recording) -> tuple[float, float]:
-    """Return start and end of a range within its file [s]; minus and plus infinity for a whole recording."""
+    """Return a range's start and end [s] after its file's first sample; minus and plus infinity for a whole one."""
     return (recording.start, recording.end) if isinstance(recording, RangeRecording) else (-np.inf, np.inf)
 
 
@@ -132,7 +132,7 @@ def overlap(one: Recording, other: Recording) -> bool:
 
 
 def without_standstill(recording: Recording, margin: float) -> RangeRecording:
-    """Return a range without the standstill before the first joint moves and after the last one stops.
+    """Return a range without standstill before the first and after the last motion, but `margin`; raises if none moves.
 
     A joint moves where its mean position over 0.1 s changes by more than 0.005 rad/s or m/s to the next 0.1 s.
 
@@ -291,7 +291,7 @@ class MeasuredRecording:
 
     @property
     def torn(self) -> bool:
-        """Return whether the file ended in the middle of a record; samples up to there are read."""
+        """Return whether the file is damaged or lacks its end mark, and is read up to there; always False for CSV."""
         return self.whole.torn
 
     @torn.setter

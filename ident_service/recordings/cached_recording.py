@@ -67,7 +67,7 @@ class CachedRecording:
 
     @property
     def torn(self) -> bool:
-        """Return whether the file ended in the middle of a record; samples up to there are read."""
+        """Return whether the file is damaged or lacks its end mark, and is read up to there; always False for CSV."""
         return self._whole.torn
 
     @torn.setter

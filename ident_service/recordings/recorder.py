@@ -163,11 +163,11 @@ class RecorderProcess:
         return 0 if self._process is None else self._process.pid
 
     def put(self, cycle: Cycle) -> bool:
-        """Put one cycle into the ring for the recorder; return whether the recorder keeps up."""
+        """Put one cycle into the ring; return whether the recorder keeps up, or in lock step wait until it does."""
         return self._open_sink().put(cycle)
 
     def event(self, stamp_ns: int, level: int, message: str) -> bool:
-        """Put one event into the ring for the recorder; return whether the recorder keeps up."""
+        """Put one event into the ring; return whether the recorder keeps up, or in lock step wait until it does."""
         return self._open_sink().event(stamp_ns, level, message)
 
     def close(self, *, complete: bool = True) -> None:

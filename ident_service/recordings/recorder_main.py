@@ -186,7 +186,7 @@ class RingConsumer:
 
 
 def serve(channel: socket.socket, ring: int, work: int, room: int) -> None:
-    """Record into the file that the request on `channel` names, until the end; answer there with report or error."""
+    """Record the ring into the file that the request on `channel` names; answer there, with a report at its end."""
     with channel.makefile("rb") as lines:
 
         def tell(answer: Mapping[str, object]) -> None:

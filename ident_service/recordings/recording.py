@@ -88,7 +88,7 @@ class Recording(Protocol):
         joints: number of joints.
         torque_zero_order_hold: whether the torque of a sample acts from its stamp until the next stamp, as in our own
             recordings; otherwise it was sampled at its stamp.
-        torn: whether the file ended in the middle of a record and was read up to there.
+        torn: whether the file is damaged or lacks its end mark, and is read up to there; always False for CSV.
     """
 
     path: Path

@@ -127,7 +127,7 @@ class RingSink:
         return self._wait() if self._lock_step else self._keeps_up()
 
     def event(self, stamp_ns: int, level: int, message: str) -> bool:
-        """Put one event behind the samples put so far; return whether the recorder keeps up, as `put` does."""
+        """Put one event into the ring; return whether the recorder keeps up, or in lock step wait until it does."""
         try:
             self.writer.event(stamp_ns, level, message)
         except struct.error as error:

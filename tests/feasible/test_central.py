@@ -93,7 +93,7 @@ def test_it_is_the_minimiser_that_another_solver_finds(likely: bool, moves: bool
     problem.solve(solver=cp.CLARABEL)
     assert problem.status == "optimal"
     if near is not None:
-        moved = np.linalg.norm(near.moved(base.K @ found))
+        moved = np.linalg.norm(near.scaled_change(base.K @ found))
         assert 0.5 < moved < 1.0
     scale = np.array([reference(name) for name in base.names])
     np.testing.assert_allclose(delta.value / scale, found / scale, rtol=1e-3, atol=1e-3)

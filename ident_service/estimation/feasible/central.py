@@ -59,8 +59,8 @@ class ChangeEllipsoid:
     metric: Array
     moves: NDArray[np.bool_]
 
-    def moved(self, beta: Array) -> Array:
-        """Return N (beta - origin), shape (rows,); its norm is below 1 inside the ellipsoid."""
+    def scaled_change(self, beta: Array) -> Array:
+        """Return N (beta - origin), shape (rows,): the change in units of the ellipsoid, of norm below 1 inside it."""
         return np.asarray(self.metric @ (beta - self.origin))
 
 
@@ -86,7 +86,7 @@ def centre(
     likely: LikelyBodies | None = None,
     near: ChangeEllipsoid | None = None,
 ) -> Array:
-    """Return link parameters moved to the centre of those with the same (or `near`) base parameters.
+    """Return link parameters moved to the feasible set's centre near likely bodies, base parameters kept (or `near`).
 
     Args:
         delta: inside the feasible set (margin above 0), SI units, shape (parameters,).
@@ -101,7 +101,7 @@ def centre(
     """
     lift = LinkParameterMap(base)
     N = np.zeros((0, base.size)) if near is None else near.metric
-    begin = np.zeros(0) if near is None else near.moved(base.K @ delta)
+    begin = np.zeros(0) if near is None else near.scaled_change(base.K @ delta)
     moving = np.zeros(0, dtype=int) if near is None else np.flatnonzero(near.moves)
     free = np.column_stack([lift.of_dependent, lift.of_beta[:, moving]])
     N = np.column_stack([np.zeros((len(N), len(lift.dependent))), N[:, moving]])

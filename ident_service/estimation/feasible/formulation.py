@@ -205,7 +205,7 @@ class ConditionsError(ParameterError, SolverError):
 
 
 def conflicting_constraints(conditions: FeasibleSet) -> tuple[str, ...]:
-    """Return the names of the conditions that conflict whatever the data; empty where some delta fulfils all of them.
+    """Return the names of the conditions that conflict whatever the data; empty if some delta has a margin above 1e-6.
 
     Below the inset that every problem keeps, the multipliers of the largest margin name the blocks of the proof.
 

@@ -114,7 +114,7 @@ class Prior:
 
 
 def residual_deviation(fit: LeastSquares) -> float:
-    """Return the residual's standard deviation that the parameters' deviations are made from (eq. 81).
+    """Return the residual's standard deviation in eq. 81; raises ParameterError if it is zero or no parameter was seen.
 
     Raises:
         ParameterError: no parameter was seen, or the residual is exactly zero.
@@ -183,7 +183,7 @@ def move_off_boundary(
     likely: LikelyBodies,
     near: ChangeEllipsoid,
 ) -> FeasibleEstimate:
-    """Return the estimate moved into the set towards likely bodies, within `near`; unchanged where the solver fails.
+    """Return the estimate moved into the set towards likely bodies, within `near`; unchanged where none is found there.
 
     Newton's method (`central.py`) needs room to begin: between links of tonnes whose masses cancel there is none.
 
@@ -208,7 +208,7 @@ def move_off_boundary(
         return held
     beta = base.K @ found
     inside = conditions.margin(found)[0]
-    if float(np.linalg.norm(near.moved(beta))) < 1.0 and inside > 0.0:
+    if float(np.linalg.norm(near.scaled_change(beta))) < 1.0 and inside > 0.0:
         return replace(held, beta=beta, delta=found, margin=inside)
     return held
 
