@@ -191,7 +191,7 @@ class _Package(ModuleType):
 
 @contextmanager
 def quick_imports() -> Iterator[None]:
-    """Import large packages lazily, collect garbage rarely and load no pydantic plugins during the block.
+    """Load large packages only when used, collect garbage rarely and load no pydantic plugins during the block.
 
     Modules make objects that stay, and looks at them are a twentieth of the time.
     """

@@ -151,7 +151,7 @@ class Connections:
             self._sending.pop(peer, None)
 
     def answered(self, peer: Peer | None) -> None:
-        """Note that a request is answered; the connection's deadline for the next one begins."""
+        """Note that a request is answered; if it was the connection's last, the deadline for the next one begins."""
         if peer in self._open:
             self._requests[peer] -= 1
             if self._requests[peer] <= 0:

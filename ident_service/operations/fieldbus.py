@@ -77,7 +77,7 @@ def bus_load(config: ArmConfig, rate: float | None = None) -> Budget:
 
 
 def require_budget(arm: str | Path, config: ArmConfig) -> Budget | None:
-    """Return the bus budget of an arm with drives on CAN; None for other arms. One that does not fit raises.
+    """Return the bus budget of an arm with drives on CAN, or None for other arms; raise ConfigError if it does not fit.
 
     Args:
         arm: file of the description, or name of a shipped one.

@@ -227,7 +227,7 @@ def compare_files(paths: Sequence[Path], out: Path | None = None) -> tuple[Compa
 
 
 def compare_into(reference: Path, folder: Path) -> Comparison:
-    """Compare a folder of results with a reference; store the comparison in the folder and its manifest anew.
+    """Compare a folder of results with a reference; write the comparison into it, renew its manifest, and return it.
 
     A kill in between leaves files that the manifest does not name, and which are therefore ignored.
 

@@ -89,7 +89,7 @@ class TestMotion:
         return self.there.duration + self.back.duration + 3.0 * DWELL
 
     def at(self, time: float) -> Setpoint:
-        """Return the setpoint at `time` [s]."""
+        """Return the setpoint at `time` [s], counted from the beginning of the first dwell."""
         time -= DWELL
         if time < self.there.duration + DWELL:
             return self.there.at(max(time, 0.0))

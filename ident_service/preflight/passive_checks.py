@@ -105,7 +105,7 @@ def identities_check(
     looked: IdleRecording,
     setup: Sequence[SetupCheck] = (),
 ) -> Check:
-    """Return the check `identities`: joints, drives, answers, torque limits and rate are those of the description.
+    """Return the check `identities`: no drive faults; joints, drives, answers, torque limits and rate as described.
 
     Args:
         described: description by the open arm.

@@ -268,7 +268,7 @@ class Session:
         self._most = (np.abs(to_drives) * self._band).max(axis=1)
 
     def energise(self) -> None:
-        """Enable the drives; ArmFault, torque off again, if the arm moved while a person had to enable it.
+        """Enable the drives; if the arm moved while a person had to enable it, end the torque and raise ArmFault.
 
         Raises:
             ArmFault: a person enabled the arm, and it had been moved meanwhile; it is without torque again.
@@ -340,7 +340,7 @@ class Session:
         return np.array([self._dynamics.torque(position, still, still) for position in positions])
 
     def exchange(self, *, sends: bool = True) -> Sample:
-        """Send the target that the guard has let pass, or none; return the cycle's sample. Raises DriverError."""
+        """Send the present target, or with `sends` False none; return the cycle's sample, or raise DriverError."""
         if not sends:
             return self._arm.exchange(None)
         return (self._arm.exchange_position if self.gives_positions else self._arm.exchange)(self._target)

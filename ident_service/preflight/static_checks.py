@@ -216,7 +216,7 @@ def distance_from_home_text(model: ArmModel, limits: MotionLimits, position: Vec
 
 
 def path_home_check(model: ArmModel, limits: MotionLimits, position: Vector) -> Check:
-    """Return the check `ways_clear`: is the straight way home from `position` [rad or m], (joints,), clear?"""
+    """Return the check `ways_clear`: the straight way home from `position` [rad or m], (joints,), is clear."""
     code = "ways_clear"
     try:
         ((_, leg),) = PointToPointPlan(Destination.HOME).legs(model, position, limits)

@@ -77,7 +77,7 @@ def arm_names(db: Database) -> list[Row]:
 
 
 def known_arm(db: Database, state: Path, name: str) -> KnownArm:
-    """Return the arm of this name with its description, loaded now; raise UnknownId where there is none.
+    """Load the description of the arm of this name, renew the registry's row, return the arm; raise UnknownId for none.
 
     Raises:
         UnknownId: there is none.
