@@ -1224,7 +1224,7 @@ def read_file(path: Path) -> str:
 
 
 def require_folder(folder: Path) -> None:
-    """Raise if a file of a results folder is not as its manifest, if any, says, or the parameters are another arm's.
+    """Raise if a file that is there differs from its manifest, if any, or the parameters are another arm's.
 
     Raises:
         OSError: a file cannot be read, or `parameters.json` is not there.
@@ -1301,7 +1301,7 @@ def answer_text(path: Path, answer: Verification) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Check the file or folder named on the command line, print the verdict, return 0 only for `feasible`, else 2 or 3.
+    """Check the file or folder on the command line, print the verdict; return 0 `feasible`, 2 no readable file, 3 else.
 
     Returns:
         0: consistent with its own conditions, and these can be met. 3: not so. 2: the file cannot be read, or is

@@ -85,7 +85,7 @@ def tell(arguments: argparse.Namespace, line: str) -> None:
 
 
 def write(stream: TextIO | None, text: str) -> None:
-    """Write and flush text; a reader that has gone, or a closed terminal, changes neither the work nor the exit code.
+    """Write and flush text; ignore a reader that has gone or a closed terminal, raise OSError for a full disk and such.
 
     Raises:
         OSError: anything else that keeps text from its place, a full disk for example.

@@ -61,7 +61,7 @@ class Job:
 
     @property
     def live(self) -> bool:
-        """Tell if the job has not ended."""
+        """Tell if the job's state is `queued` or `running`, which it stays while its end cannot be registered."""
         return self.state in _LIVE
 
     @property

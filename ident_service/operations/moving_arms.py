@@ -64,7 +64,7 @@ def held_arm(state: Path, arm: str) -> bool:
 
 
 def moving_arms(state: Path) -> list[str]:
-    """Return the names of the arms that any process moves."""
+    """Return the names of the arms that any process moves or holds."""
     return _reach(state, None, controlling_pid)
 
 

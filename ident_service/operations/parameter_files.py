@@ -277,7 +277,7 @@ class PayloadResult:
 
 
 def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_offsets: bool = False) -> PayloadResult:
-    """Identify the payload that an identified arm carries, and write the results.
+    """Identify the payload that an identified arm carries; write the results, in place of earlier ones in `out`.
 
     Args:
         run: folder of results of the arm.

@@ -286,7 +286,7 @@ class Session:
     def follow(
         self, reference: Reference, seconds: float, learning: float = 0.0, shaking: tuple[Vector, float] | None = None
     ) -> Rows:
-        """Control the arm along a reference for some seconds, under the guard; return each cycle's sample and setpoint.
+        """Control the arm along a reference for some seconds, safety checks on; return each cycle's sample and target.
 
         Args:
             reference: trajectory from the present setpoint on.
@@ -384,7 +384,7 @@ class Session:
             self._target = self._passed(asked.position) if self.gives_positions else self._limited(wanted)
 
     def repeat_last_torque(self) -> None:
-        """Keep the last target, through the guard, as that of the next cycle, while drives report no positions.
+        """Keep the last target for the next cycle, after the safety checks, while drives report no positions.
 
         Raises:
             ArmFault: the guard found something that is more than a warning.

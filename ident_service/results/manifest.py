@@ -74,7 +74,7 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
 
 @contextmanager
 def staging_beside(folder: Path) -> Iterator[Path]:
-    """Yield a place beside a folder to build its content in; removed with its content after an error.
+    """Yield a new folder beside another to build its content in, for the caller to rename; removed after an error.
 
     Raises:
         UsageError: the folder's place cannot be written, or is a file.

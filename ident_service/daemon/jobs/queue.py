@@ -435,7 +435,7 @@ class Engine:
         self.beat = now()
 
     def start(self, first: Callable[[], Any] = lambda: None) -> None:
-        """Mark the jobs that were interrupted, then begin to run the queue; returns at once.
+        """Mark interrupted jobs, requeue waiting computations, then begin to run the queue; returns at once.
 
         Args:
             first: function that the queue's thread calls before it begins anything.
@@ -546,7 +546,7 @@ class Engine:
         return Progress(found.phase, None, None) if self.live.end_reason(row["id"]) else found
 
     def moving(self) -> list[str]:
-        """Return the names of the arms that any process moves."""
+        """Return the names of the arms that any process moves or holds."""
         return moving_arms(self.state)
 
     def begin_closing(self) -> None:
