@@ -227,7 +227,7 @@ def compare_files(paths: Sequence[Path], out: Path | None = None) -> tuple[Compa
 
 
 def compare_into(reference: Path, folder: Path) -> Comparison:
-    """Compare a folder of results with a reference; write the comparison into it, renew its manifest, and return it.
+    """Compare a folder of results with a reference; write that into the folder and its manifest; return the comparison.
 
     A kill in between leaves files that the manifest does not name, and which are therefore ignored.
 

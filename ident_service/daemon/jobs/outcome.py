@@ -200,7 +200,7 @@ _ABOUT_A_RUN = frozenset({"report", "verify", "compare", "judge", "feasible"})
 
 
 def register_outputs(db: Database, state: Path, row: Row, by: str) -> None:
-    """Register the run or motion folder that a job's process has left, or raise the drift alarms of its fleet.
+    """Register the run or motion folder that a job left, adding a lacking manifest, or raise the alarms of its fleet.
 
     Args:
         db: the registry.
