@@ -351,7 +351,7 @@ def follow(
     ours: bool = True,
     every: float = _LOOK,
 ) -> dict[str, Any]:
-    """Poll a job to its end, print its phases, renew its lease, cancel it once `over`; return it as it was last seen.
+    """Poll a job to its end, print its phases, renew its lease, cancel it once `over()`; return it as last seen.
 
     Args:
         client: of the daemon.

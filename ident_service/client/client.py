@@ -207,7 +207,7 @@ class IdentClient(Connection):
         return _job(self.get(f"{_API}/jobs/{_word(job)}"))
 
     def events(self, *, after: int | None = None, samples: bool = False) -> Iterator[Event]:
-        """Yield events of all arms and jobs until the caller stops, reconnecting some times where the stream breaks.
+        """Yield events of all arms and jobs until the caller stops; reconnect if the stream breaks, raise if in vain.
 
         After a broken connection the stream is resumed where it broke off, so that no event is missed or repeated.
 

@@ -103,7 +103,7 @@ class Authenticator:
         return None if key is None else self._tokens.get(key)
 
     def by_token(self, secret: str, address: str) -> Access | None:
-        """Look a token up in the registry; return its name and role, or None, a failed attempt; Throttled after many.
+        """Return a token's name and role by the registry; None, a failed attempt, if unknown; Throttled after too many.
 
         Raises:
             Throttled: too many failed attempts; a token that was good from this address before is still heard.

@@ -197,7 +197,7 @@ def design_files(
 
 
 def preview_files(arm: str, motion: Path | None, knowledge: PriorData, folder: Path | None) -> Preview:
-    """Predict how a motion goes and what it teaches; return that, with text, values and drawings in a folder if given.
+    """Predict how a motion goes and what it teaches, and return it; write text, values and drawings if given a folder.
 
     Args:
         arm: description file, or the name of a shipped one.

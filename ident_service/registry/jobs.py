@@ -129,7 +129,7 @@ def enter_key(db: Database, who: str, key: str, request: str, job: str) -> None:
 
 
 def job_of_key(db: Database, who: str, key: str, request: str) -> Row | None:
-    """Return the job that this request with its key made within a day, or None; AlreadyThere if the key's was another.
+    """Return the job that this key made within a day, or None; raise AlreadyThere if that was for another request.
 
     Raises:
         AlreadyThere: the key was used to ask for something else.

@@ -456,7 +456,7 @@ class Engine:
 
     @property
     def healthy(self) -> bool:
-        """Return whether both threads live, the queue's turned within 30 s, and no job's end waits to be registered."""
+        """Return whether both threads run, the queue's loop within 30 s, and no job's end waits to be registered."""
         alive = self._thread.is_alive() and self.live.healthy
         return alive and self._now() - self.beat < 30.0 and not any(one.unentered for one in self.live.entered())
 
