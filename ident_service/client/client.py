@@ -383,7 +383,7 @@ class RemoteArm:
         self.client.post(f"{self._path}/faults/{_word(code)}/ack")
 
     def check(self, motion: str | None = None, *, confirm: str) -> RemoteMotion:
-        """Queue the preflight of a motion, the description's if None; its handle's `with` block renews the lease."""
+        """Queue the preflight of a motion, the description's if None; return a handle whose block renews the lease."""
         return self._begin("check", confirm, motion=motion)
 
     def run(

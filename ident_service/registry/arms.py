@@ -72,7 +72,7 @@ def know_shipped(db: Database) -> None:
 
 
 def arm_names(db: Database) -> list[Row]:
-    """Return the rows of all arms by name: source, folder, text and hash of the description, when and by whom added."""
+    """Return the rows of all arms by name: source, folder, short description, hash, when and by whom added."""
     return db.rows("SELECT name, source, folder, description, sha256, added, added_by FROM arms ORDER BY name")
 
 
