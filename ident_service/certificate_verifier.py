@@ -546,7 +546,7 @@ _EQUALITY_FORMS: tuple[tuple[str, Form], ...] = (
 
 
 def is_assumed(name: str) -> bool:
-    """Tell if a condition's name begins with `assumed: `: a bound that a disproof assumes, no description's."""
+    """Tell if a condition's name begins with `assumed: `: a disproof adds such bounds, which no arm description has."""
     return name.startswith("assumed: ")
 
 
@@ -627,12 +627,12 @@ class Claim:
 
     @property
     def implied(self) -> frozenset[str]:
-        """Return the names of the conditions on each link's inertia, of which the feasible set itself consists."""
+        """Return the names of the conditions on each link's inertia, which make up the feasible set itself."""
         return frozenset(block.name for block in self.blocks[: len(self.links)])
 
 
 def read_claim(document: dict[str, object], certificate: dict[str, object]) -> Claim:
-    """Parse and check what a certificate is about: the file's base parameters, and the conditions of its set and list.
+    """Parse the base parameters and the conditions that a certificate is about; raise if they do not fit together.
 
     Raises:
         VerificationError: anything missing, contradictory, foreign or larger than a real one.
@@ -1224,7 +1224,7 @@ def read_file(path: Path) -> str:
 
 
 def require_folder(folder: Path) -> None:
-    """Raise unless a results folder's files are those of its manifest, and its parameters those of its arm.
+    """Raise if a file that is there differs from its manifest, if any, or the parameters are another arm's.
 
     Raises:
         OSError: a file cannot be read, or `parameters.json` is not there.
@@ -1301,7 +1301,7 @@ def answer_text(path: Path, answer: Verification) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Check the file or folder named on the command line, print the verdict, and return the exit code 0, 2 or 3.
+    """Check the file or folder on the command line, print the verdict; return 0 `feasible`, 2 no readable file, 3 else.
 
     Returns:
         0: consistent with its own conditions, and these can be met. 3: not so. 2: the file cannot be read, or is

@@ -54,7 +54,7 @@ def terminal_user(arguments: argparse.Namespace) -> str:
 
 @contextmanager
 def registry(arguments: argparse.Namespace, *, arms: bool = True) -> Iterator[tuple[Database, Path]]:
-    """Open the registry of the state folder that a verb works on; yield it and the folder.
+    """Open the registry of a verb's state folder, entering the shipped arms if `arms`; yield it and the folder.
 
     Args:
         arguments: of the verb.
@@ -71,7 +71,7 @@ def registry(arguments: argparse.Namespace, *, arms: bool = True) -> Iterator[tu
 
 
 def write_audit_entry(arguments: argparse.Namespace, what: str, about: str, **detail: Any) -> None:
-    """Write to the audit trail what was done at a terminal; no registry: nothing; one that fails: later. Never raises.
+    """Write to the audit trail what was done at a terminal, or queue it if that fails; nothing without a registry.
 
     It has been done already: a registry that is kept or full changes nothing, and the line is entered later.
 
@@ -287,7 +287,7 @@ def _delete(arguments: argparse.Namespace) -> Answer:
 
 @contextmanager
 def deleted_with_anyway(kind: str, name: str) -> Iterator[None]:
-    """Re-raise an InUse error of the block that lists dependents, with the command that deletes all the same added."""
+    """Add `ident KINDs delete NAME --anyway`, the command that deletes all the same, to an InUse error of the block."""
     try:
         yield
     except InUse as error:

@@ -191,7 +191,7 @@ class _Package(ModuleType):
 
 @contextmanager
 def quick_imports() -> Iterator[None]:
-    """Import large packages lazily, collect garbage rarely and load no pydantic plugins during the block.
+    """Put off large packages' own code until needed; in the block, collect garbage rarely and load no pydantic plugins.
 
     Modules make objects that stay, and looks at them are a twentieth of the time.
     """

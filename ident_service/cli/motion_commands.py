@@ -97,7 +97,7 @@ class HeldKey:
         return self._released
 
     def wait(self, given_up: Callable[[], bool], seconds: float = 0.02) -> bool:
-        """Wait until the key is held; False when it never will be, or `given_up` says so. Looks every `seconds`."""
+        """Wait until the key is held; return False once it was released, the terminal is gone or `given_up` says so."""
         while not self.held():
             if self._released or given_up():
                 return False

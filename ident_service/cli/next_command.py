@@ -130,7 +130,7 @@ def with_arm(arguments: argparse.Namespace, text: str) -> str:
 
 
 def command(arguments: argparse.Namespace, words: Sequence[str]) -> str:
-    """Return the shell line `ident WORDS`, with the `--state` and `--server` that the arguments have."""
+    """Return the shell line `ident WORDS` with the given `--state`, and `--server` unless the verb is only local."""
     more = [] if arguments.state is None or "--state" in words else ["--state", arguments.state]
     local = words[0] in LOCAL_ONLY or " ".join(words[:2]) in LOCAL_ONLY
     more += [] if getattr(arguments, "server", None) is None or local else ["--server", arguments.server]

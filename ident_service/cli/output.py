@@ -60,7 +60,7 @@ def print_error(kind: str, message: str, code: int, more: Mapping[str, object] |
 
 
 def print_to_person(text: str) -> None:
-    """Write text, which has its own line breaks, to stderr; that there is none, or its disk is full, is ignored."""
+    """Write text as it is, with no line break added, to stderr; ignore that it cannot be written."""
     with suppress(OSError):
         write(sys.stderr, text)
 
@@ -70,7 +70,7 @@ def _print_json(document: dict[str, Any]) -> None:
 
 
 def person_types() -> bool:
-    """Return whether standard input is a terminal, so that a person can be asked; it may be closed."""
+    """Return whether standard input is open and a terminal, so that a person can be asked."""
     return sys.stdin is not None and sys.stdin.isatty()
 
 
@@ -85,7 +85,7 @@ def tell(arguments: argparse.Namespace, line: str) -> None:
 
 
 def write(stream: TextIO | None, text: str) -> None:
-    """Write and flush text; a reader that has gone, or a closed terminal, changes neither the work nor the exit code.
+    """Write and flush text; ignore a reader that has gone or a closed terminal, raise OSError for a full disk and such.
 
     Raises:
         OSError: anything else that keeps text from its place, a full disk for example.
@@ -144,7 +144,7 @@ def state_folder(arguments: argparse.Namespace) -> Path:
 
 
 def writable_state_folder(arguments: argparse.Namespace) -> Path:
-    """Return the state folder for a verb that writes there, after checking that only its owner can enter it.
+    """Return the state folder for a verb that writes there, and set the umask; raise UsageError if others can enter it.
 
     Raises:
         UsageError: as `state_folder`; or others can enter it.

@@ -154,7 +154,7 @@ def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
 
 @contextmanager
 def telling_of_arm(arm: str, job: str) -> Iterator[None]:
-    """Re-raise an ArmError of the block, a daemon that is gone, with what the arm does that it moved."""
+    """Re-raise an ArmError of the block, which says that the daemon is gone, adding how the arm stops by itself."""
     from ident_service.client import left_alone
 
     try:
@@ -351,7 +351,7 @@ def follow(
     ours: bool = True,
     every: float = _LOOK,
 ) -> dict[str, Any]:
-    """Poll a job until it has ended, print its phases and renew its lease; return the job as it was last.
+    """Poll a job to its end, print its phases, renew its lease, cancel it once `over()`; return it as last seen.
 
     Args:
         client: of the daemon.
@@ -405,7 +405,7 @@ def follow(
 
 
 def renew(client: IdentClient, job: str) -> bool:
-    """Renew the lease of a job; return False where it has none any more, which is so from when its motion is to end."""
+    """Renew the lease of a job and return True; return False if it has none, as its motion is ending or has ended."""
     try:
         client.post(f"/api/v1/jobs/{job}/lease")
     except IdentError as error:
@@ -473,7 +473,7 @@ def confirmation(client: IdentClient, arguments: argparse.Namespace, name: str |
 
 
 def motion_id(client: IdentClient, arm: str, motion: Path | None) -> str | None:
-    """Return the id of a motion, uploading it first if it is a file; raise UnknownId if the daemon does not have it."""
+    """Return the id of a motion, uploading it first if it is a file; None for None; raise UnknownId for a wrong id."""
     if motion is None:
         return None
     if motion.is_file():

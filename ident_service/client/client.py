@@ -61,7 +61,7 @@ class Job:
 
     @property
     def live(self) -> bool:
-        """Tell if the job has not ended."""
+        """Tell if the job's state is `queued` or `running`, which it stays while its end cannot be registered."""
         return self.state in _LIVE
 
     @property
@@ -207,7 +207,7 @@ class IdentClient(Connection):
         return _job(self.get(f"{_API}/jobs/{_word(job)}"))
 
     def events(self, *, after: int | None = None, samples: bool = False) -> Iterator[Event]:
-        """Yield the events of all arms and jobs, reconnecting where the stream breaks, until the caller stops.
+        """Yield events of all arms and jobs until the caller stops; reconnect if the stream breaks, raise if in vain.
 
         After a broken connection the stream is resumed where it broke off, so that no event is missed or repeated.
 
@@ -383,7 +383,7 @@ class RemoteArm:
         self.client.post(f"{self._path}/faults/{_word(code)}/ack")
 
     def check(self, motion: str | None = None, *, confirm: str) -> RemoteMotion:
-        """Queue the preflight of a motion, the description's if None; return a handle with the lease, as `run`."""
+        """Queue the preflight of a motion, the description's if None; return a handle whose block renews the lease."""
         return self._begin("check", confirm, motion=motion)
 
     def run(
@@ -408,7 +408,7 @@ class RemoteArm:
         return self._begin("home", confirm)
 
     def finish(self) -> None:
-        """End the arm's run early and in order: the rest of the motion is left out, the arm goes to its start."""
+        """Ask the arm's run to end early, without waiting: it leaves out the rest and goes to its start."""
         self.client.post(f"{self._path}/finish")
 
     def accept(self, run: str, note: str) -> dict[str, Any]:

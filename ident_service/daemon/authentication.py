@@ -103,7 +103,7 @@ class Authenticator:
         return None if key is None else self._tokens.get(key)
 
     def by_token(self, secret: str, address: str) -> Access | None:
-        """Look a token up in the registry; return its name and role, or None, counted as a failed attempt, if unknown.
+        """Return a token's name and role by the registry; None, a failed attempt, if unknown; Throttled after too many.
 
         Raises:
             Throttled: too many failed attempts; a token that was good from this address before is still heard.
@@ -151,7 +151,7 @@ class Authenticator:
         return word
 
     def confirm(self, word: str, arm: str, who: str) -> bool:
-        """Return whether the challenge was given to this caller for this arm and has not expired; it is used up."""
+        """Return whether the challenge was given to this caller for this arm and still counts; use it up either way."""
         with self._lock:
             entry = self._challenges.pop(word, None)
         return entry is not None and (entry.arm, entry.who) == (arm, who) and entry.until >= self._now()

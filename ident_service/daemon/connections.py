@@ -52,7 +52,7 @@ Peer = tuple[str, int]
 
 
 def raise_connection_limit() -> int:
-    """Raise the limit of open files as far as allowed, and return how many connections it leaves room for."""
+    """Raise this process's limit of open files as far as allowed; return how many connections to accept at a time."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = _DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, _DESCRIPTORS)
     if soft != resource.RLIM_INFINITY and soft < wanted:
@@ -151,7 +151,7 @@ class Connections:
             self._sending.pop(peer, None)
 
     def answered(self, peer: Peer | None) -> None:
-        """Note that a request is answered; the connection's deadline for the next one begins."""
+        """Note that a request is answered; if it was the connection's last, the deadline for the next one begins."""
         if peer in self._open:
             self._requests[peer] -= 1
             if self._requests[peer] <= 0:
@@ -227,7 +227,7 @@ class Listener(socket.socket):
         self._book, self._accepted, self._gone = book, 0, 0
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """Return (socket, address) of the next connection that is admitted; the others are closed.
+        """Return (socket, address) of the next admitted connection, closing refused ones; BlockingIOError if none.
 
         Raises:
             BlockingIOError: nobody waits, or it is somebody else's turn in the event loop.

@@ -76,7 +76,7 @@ def address_of(request: Request) -> str:
 
 
 async def access_of(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> Access | None:
-    """Return name and role of the caller by token or session; None without a valid session and without a token.
+    """Return the caller's name and role by token or session; None without token or valid session; 401 for a bad token.
 
     Raises:
         HTTPException: 401 for an unknown token, 429 after too many failed attempts, 403 for a changing request with a
@@ -138,7 +138,7 @@ async def local_or_authenticated(request: Request, bearer: Bearer = None, cookie
 
 
 async def lease_keeper(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> Access:
-    """Return the caller who renews a lease, as `operator`, but from memory without waiting for the registry.
+    """Return the operator who renews a lease, known from memory if possible, so that the registry is not waited for.
 
     Raises:
         HTTPException: as `operator`.

@@ -54,7 +54,7 @@ ANYWAY: Final = "; `?anyway=true` deletes it all the same"
 
 
 def failures(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """Return the `responses` of a route: its own failure statuses, besides those that any route may have.
+    """Return the OpenAPI `responses` of a route: these failure statuses and those that any route may have.
 
     They refer to `Failure`; with that as their model, FastAPI would make a validator of each status of each route.
     """

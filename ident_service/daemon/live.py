@@ -131,7 +131,7 @@ class LiveRun:
         self.broken = ""
 
     def since(self, number: int) -> list[Frame]:
-        """Return the frames numbered above `number`, after reading on in the recording if nobody has just done so."""
+        """Return the kept frames numbered above `number`, after reading on in the recording unless just done."""
         now = self._now()
         self._seen = now
         if self._lock.acquire(blocking=False):

@@ -27,7 +27,7 @@ _LOG_BYTES = 64 * 1024
 
 
 def log_of(service: Service, row: Row) -> str:
-    """Return the end of what the process of a job has printed."""
+    """Return the end of what a job's process has printed, without paths of this machine."""
     log: str = jobs.without_paths(process_output(service.state / JOBS / row["id"], _LOG_BYTES).log, str(service.state))
     return log
 

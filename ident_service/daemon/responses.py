@@ -34,7 +34,7 @@ class DeletionAnswer(BaseModel):
 
 
 def deletion_answer(name: str, dependents: Sequence[Dependent]) -> DeletionAnswer:
-    """Return the answer after an entry was deleted."""
+    """Return the API's answer to a deletion: the name of what was deleted, and what had referred to it."""
     return DeletionAnswer(deleted=name, dependents=[DependentAnswer(**asdict(one)) for one in dependents])
 
 

@@ -109,7 +109,7 @@ class RepeatFilter(logging.Filter):
         self._kinds: dict[tuple[str, str, object], tuple[float, int]] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return whether to write a line: False after `_MOST_ALIKE` lines of its logger, template and status."""
+        """Return whether to write a line: False after `_MOST_ALIKE` of its logger, template and status within 10 s."""
         kind = (record.name, str(record.msg)[:80], getattr(record, "status", None))
         with self._lock:
             if len(self._kinds) > _MOST_KINDS:
@@ -172,7 +172,7 @@ _LOG = logging.getLogger("ident.serve")
 
 
 def serve(settings: Settings, tell: Callable[[str], None] = lambda _: None) -> None:
-    """Serve the API until a signal ends the process.
+    """Serve pages and API until a signal ends it; meanwhile the state folder's `serve.url` holds the address.
 
     Args:
         settings: settings of the service.

@@ -66,7 +66,7 @@ class Settings:
 
     @property
     def loopback(self) -> bool:
-        """Return whether the service listens at a loopback address or `localhost`, where only this machine comes."""
+        """Return whether the service listens at a loopback address or `localhost`: only this machine reaches it."""
         try:
             return ipaddress.ip_address(self.host).is_loopback
         except ValueError:

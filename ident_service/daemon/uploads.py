@@ -328,7 +328,7 @@ class Piece:
 
 
 def complete_upload(db: Database, state: Path, upload: str, who: str) -> Upload:
-    """Make a run of a recording that has arrived whole, if its hash is right; return the upload with the run's id.
+    """Make a run of a whole upload, return it with the run's id; if its hash or content is wrong, delete it and raise.
 
     Args:
         db: the registry.

@@ -204,7 +204,7 @@ class ScaleCheck:
 
 
 def check_scale(config: ArmConfig, state: Path, ask: Callable[[str], str], arm: Arm | None = None) -> list[ScaleCheck]:
-    """Have a person turn each joint by hand, compare with the drives' positions, and write `scale.json`.
+    """Have a person turn joints by hand, compare with the drives' positions, write `scale.json`, return what was found.
 
     Args:
         config: of the arm; nothing is energised.

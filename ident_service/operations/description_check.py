@@ -53,7 +53,7 @@ class CheckedDescription:
 
     @property
     def assumed_brakes(self) -> tuple[str, ...]:
-        """Return the joints that would fall and whose brake is not described, but assumed of a simulated drive."""
+        """Return the joints that gravity moves without torque and for which the description gives no `brake`."""
         joints = self.model.config.joints
         return tuple(name for name in self.falling if name not in joints or joints[name].brake is None)
 

@@ -43,7 +43,7 @@ def judge_apart(path: Path) -> dict[str, Any]:
 
 
 def describe_apart(path: Path, name: str) -> dict[str, Any]:
-    """Make a description of an uploaded URDF in a separate process; return it, its files, and what was guessed.
+    """Make a description of an uploaded URDF in a separate process; return `description` (YAML), `files` and `guessed`.
 
     Args:
         path: path of the URDF, its meshes beside it.
@@ -162,7 +162,7 @@ def _require_own_meshes(source: Path) -> None:
 
 
 def main(words: list[str]) -> int:
-    """Judge or draw the description file named first, or describe the URDF there; print the answer as JSON."""
+    """Judge, draw or describe the file named first, memory and time of this process bounded; print JSON, return 0."""
     if words[1:2] == [_NEW]:
         return answer_within(MOST_MEMORY, _NEW_SECONDS, lambda: _new_document(Path(words[0]), words[2]))
     if words[1:2] == [_DRAW]:

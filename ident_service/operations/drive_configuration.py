@@ -368,7 +368,7 @@ def _is_set_back(objects: Objects, change: Change) -> bool:
 def store_or_restore(
     config: ArmConfig, *, store: bool, dry: bool = False, open_bus: Callable[[ArmConfig], list[Link]] = open_links
 ) -> tuple[int, ...]:
-    """Make all drives store their configuration (1010h) or restore the delivered one (1011h); return their nodes.
+    """Make all drives store their configuration (1010h) or restore the delivered one (1011h), unless `dry`; list nodes.
 
     What is restored takes effect when the drives' power has been switched off and on.
 

@@ -77,7 +77,7 @@ def bus_load(config: ArmConfig, rate: float | None = None) -> Budget:
 
 
 def require_budget(arm: str | Path, config: ArmConfig) -> Budget | None:
-    """Return the bus budget of an arm with drives on CAN; None for other arms. One that does not fit raises.
+    """Return the bus budget of an arm with drives on CAN, or None for other arms; raise ConfigError if it does not fit.
 
     Args:
         arm: file of the description, or name of a shipped one.
@@ -232,7 +232,7 @@ class Scan:
 
     @property
     def complete(self) -> bool:
-        """Return whether every configured drive is there and is the configured one."""
+        """Return whether every configured drive is there and is the configured one; further nodes do not count."""
         return all(line.match in _GOOD for line in self.lines)
 
 
@@ -392,7 +392,7 @@ class Probe:
 
     @property
     def good(self) -> bool:
-        """Return whether every drive can be driven."""
+        """Return whether every drive has answered and can be driven without any change of the description."""
         return all(one.drivable for one in self.probed)
 
     @property

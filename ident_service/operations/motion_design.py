@@ -197,7 +197,7 @@ def design_files(
 
 
 def preview_files(arm: str, motion: Path | None, knowledge: PriorData, folder: Path | None) -> Preview:
-    """Predict how a motion goes and what it teaches; write text, values and drawings where a folder is given.
+    """Predict how a motion goes and what it teaches, and return it; write text, values and drawings if given a folder.
 
     Args:
         arm: description file, or the name of a shipped one.

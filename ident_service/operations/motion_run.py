@@ -85,7 +85,7 @@ class ProcessResult:
 
     @property
     def reported(self) -> bool:
-        """Return whether the motion process reported a result."""
+        """Return whether the motion process reported a run or an error before it ended."""
         return bool(self.report or self.error)
 
     def raise_for(self, faults: FaultStore) -> None:

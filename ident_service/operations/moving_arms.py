@@ -12,7 +12,7 @@ from ident_service.registry.state_folder import control_path
 
 
 def stop_arms(state: Path, arm: str | None) -> list[str]:
-    """Bring an arm, or all, to a controlled stop and block motions asked for before; return the arms reached.
+    """Request a controlled stop of an arm, or all, and block motions asked for before; return the arms reached.
 
     Args:
         state: the state folder.
@@ -64,7 +64,7 @@ def held_arm(state: Path, arm: str) -> bool:
 
 
 def moving_arms(state: Path) -> list[str]:
-    """Return the names of the arms that any process moves."""
+    """Return the names of the arms that any process moves or holds."""
     return _reach(state, None, controlling_pid)
 
 

@@ -227,7 +227,7 @@ def compare_files(paths: Sequence[Path], out: Path | None = None) -> tuple[Compa
 
 
 def compare_into(reference: Path, folder: Path) -> Comparison:
-    """Compare a folder of results with a reference; store the comparison in the folder and its manifest anew.
+    """Compare a folder of results with a reference; write that into the folder and its manifest; return the comparison.
 
     A kill in between leaves files that the manifest does not name, and which are therefore ignored.
 
@@ -277,7 +277,7 @@ class PayloadResult:
 
 
 def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_offsets: bool = False) -> PayloadResult:
-    """Identify the payload that an identified arm carries, and write the results.
+    """Identify the payload that an identified arm carries; write the results, in place of earlier ones in `out`.
 
     Args:
         run: folder of results of the arm.

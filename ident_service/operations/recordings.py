@@ -37,7 +37,7 @@ _OF_ALL = ("gap", "stamps", "rate")
 
 
 def file_and_range(path: Path) -> tuple[Path, tuple[float, float] | None]:
-    """Split `FILE@START:END` into (file, (start, end) [s]); the latter None without a range or for such a file.
+    """Split `FILE@START:END` into (file, (start, end) [s]); None as range without one, or if the whole path exists.
 
     Raises:
         UsageError: the range ends before it begins.
@@ -73,7 +73,7 @@ def open_together(
     torque: Torque | None = None,
     payloads: Mapping[Path, Payload] = MappingProxyType({}),
 ) -> OpenedRecordings:
-    """Open recordings for one estimate: with measured torques if all have them, else with commanded ones.
+    """Open recordings for one estimate: with the torque demanded, else measured if all have that, else commanded.
 
     Torques that drives measured and commanded ones differ by the error of the current loops, and each has its
     own delay. So measured ones are used where all recordings have them, and commanded ones otherwise.

@@ -73,7 +73,7 @@ class Recovery:
 
 
 def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str | None = None) -> Recovery:
-    """Read an arm's state, reset its drives if all faults are acknowledged, and list the next steps.
+    """Read an arm's state, reset its drives if no process has it and all faults are acknowledged; list the next steps.
 
     Args:
         config: of the arm.
@@ -270,7 +270,7 @@ class ZeroingResult:
 
 
 def home_posture(config: ArmConfig) -> tuple[JointPosture, ...]:
-    """Return the home position of every joint, in which the arm must stand for set-home (`zero: at_home`).
+    """Return each joint's home position, where the arm must stand for set-home; UsageError unless `zero: at_home`.
 
     Raises:
         UsageError: its description does not say `zero: at_home`, or has no home of every joint.

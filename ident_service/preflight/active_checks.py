@@ -89,7 +89,7 @@ class TestMotion:
         return self.there.duration + self.back.duration + 3.0 * DWELL
 
     def at(self, time: float) -> Setpoint:
-        """Return the setpoint at `time` [s]."""
+        """Return the setpoint at `time` [s], counted from the beginning of the first dwell."""
         time -= DWELL
         if time < self.there.duration + DWELL:
             return self.there.at(max(time, 0.0))
@@ -156,7 +156,7 @@ def follow_stroke(session: Session, stroke: TestMotion) -> tuple[Rows, Rows]:
 
 
 def judge_response(trace: Trace, stroke: TestMotion, session: Session) -> JointResponse:
-    """Return what a complete test motion shows: displacement and response to torque over those expected, and doubt."""
+    """Return what a complete test motion shows: displacement and response over expected, deviation of the latter."""
     answers, doubt = _response_to_torque(trace, stroke.joint, session)
     return JointResponse(_displaced(trace, stroke) / stroke.amplitude, answers, doubt)
 
@@ -495,7 +495,7 @@ def gravity_check(
 def holding_fault_check(
     session: Session, model: ArmModel, limits: MotionLimits, friction: ExpectedFriction, error: ArmFault
 ) -> Check:
-    """Return the failed check `gravity`, with why a fault ended the holding of the arm: fault, sign or load.
+    """Return the failed check on a fault that ended the holding: `direction` for a wrong sign, else `gravity`.
 
     Causes: a wrong sign that explains how the arm moved; what the fault itself says; or a load: an arm that sinks,
     although the torque that holds it is above the model's. Its joints stick on the way, like a frozen encoder.

@@ -95,7 +95,7 @@ def hidden_delay(trace: Trace, expected: Vector, joint: int) -> Delay | None:
 
 
 def delay_measures(delays: Sequence[Delay], model: ArmModel, period: float) -> list[Measure]:
-    """Return the hidden delay of all joints together as a measure, limited if it is well known, and that of each.
+    """Return a measure of all joints' hidden delay together, with a limit if it is known well, and one of each joint.
 
     Each joint's own delay is told, too. Nothing is judged where all together do not know it to `_SURE` of a cycle.
     """

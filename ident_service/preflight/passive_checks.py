@@ -105,7 +105,7 @@ def identities_check(
     looked: IdleRecording,
     setup: Sequence[SetupCheck] = (),
 ) -> Check:
-    """Return the check `identities`: joints, drives, answers, torque limits and rate are those of the description.
+    """Return the check `identities`: joints, drives, answers, torque limits and rate as described, no drive faulted.
 
     Args:
         described: description by the open arm.
@@ -170,7 +170,7 @@ def identities_check(
 def at_rest_check(
     looked: IdleRecording, model: ArmModel, limits: MotionLimits, closed: LastPosition | None = None
 ) -> Check:
-    """Return the check `at_rest`: no drift without torque, inside position limits, no motor whole turns elsewhere.
+    """Return the check `at_rest`: no drift without torque, inside position limits, no motor moved by whole turns.
 
     Args:
         looked: idle recording of the arm.

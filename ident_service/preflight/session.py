@@ -268,7 +268,7 @@ class Session:
         self._most = (np.abs(to_drives) * self._band).max(axis=1)
 
     def energise(self) -> None:
-        """Enable the drives; ArmFault, torque off again, if the arm moved while a person had to enable it.
+        """Enable the drives; if the arm moved while a person had to enable it, end the torque and raise ArmFault.
 
         Raises:
             ArmFault: a person enabled the arm, and it had been moved meanwhile; it is without torque again.
@@ -286,7 +286,7 @@ class Session:
     def follow(
         self, reference: Reference, seconds: float, learning: float = 0.0, shaking: tuple[Vector, float] | None = None
     ) -> Rows:
-        """Control the arm along a reference for some seconds, under the guard; return each cycle's sample and setpoint.
+        """Control the arm along a reference for some seconds, safety checks on; return each cycle's sample and target.
 
         Args:
             reference: trajectory from the present setpoint on.
@@ -340,7 +340,7 @@ class Session:
         return np.array([self._dynamics.torque(position, still, still) for position in positions])
 
     def exchange(self, *, sends: bool = True) -> Sample:
-        """Send the target that the guard has let pass, or none; return the cycle's sample. Raises DriverError."""
+        """Send the present target, or with `sends` False none; return the cycle's sample, or raise DriverError."""
         if not sends:
             return self._arm.exchange(None)
         return (self._arm.exchange_position if self.gives_positions else self._arm.exchange)(self._target)
@@ -384,7 +384,7 @@ class Session:
             self._target = self._passed(asked.position) if self.gives_positions else self._limited(wanted)
 
     def repeat_last_torque(self) -> None:
-        """Keep the last target, through the guard, as that of the next cycle, while drives report no positions.
+        """Keep the last target for the next cycle, after the safety checks, while drives report no positions.
 
         Raises:
             ArmFault: the guard found something that is more than a warning.

@@ -273,7 +273,7 @@ def drive_matrix(model: ArmModel, delta: Vector) -> Vector:
 
 
 def known_drives(model: ArmModel) -> Vector:
-    """Return the drive inertia that the description states beyond the prior's [kg m^2 or kg], shape (joints,)."""
+    """Return drive inertia that the description states beyond the prior's [kg m^2 or kg], (joints,); 0 if no prior."""
     joints = [model.config.joints.get(name) for name in model.chain.names]
     said = np.array([0.0 if joint is None else joint.drive_inertia or 0.0 for joint in joints])
     if model.prior is None:

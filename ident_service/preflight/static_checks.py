@@ -79,7 +79,9 @@ def configuration_check(model: ArmModel, load: Budget | None = None) -> Check:
 
 
 def long_silence(model: ArmModel, limits: MotionLimits, seconds: float | None) -> str:
-    """Return a sentence if joints can fall and drives act on for too long without their host; else an empty text.
+    """Return a sentence if drives act on too long without host and joints can fall; empty if not, or not known.
+
+    It is empty, too, where the description says why that is safe (`watchdog_reason`).
 
     Args:
         model: model of the arm, with a prior.
@@ -167,7 +169,7 @@ def _leg_speeds(model: ArmModel, leg: Reference, what: str) -> list[Measure]:
 
 @unhurried()
 def stability_check(model: ArmModel, limits: MotionLimits, excitation: Excitation | None) -> Check:
-    """Return the check `stability`: the gains are stable at rate and delay, at home, mid-range and along the motion.
+    """Return the check `stability`: gains stable at home, mid-range and on the motion; skipped for position drives.
 
     Drives that are given positions close the loop by themselves, with gains of their maker's tool.
     """
@@ -216,7 +218,7 @@ def distance_from_home_text(model: ArmModel, limits: MotionLimits, position: Vec
 
 
 def path_home_check(model: ArmModel, limits: MotionLimits, position: Vector) -> Check:
-    """Return the check `ways_clear`: is the straight way home from `position` [rad or m], (joints,), clear?"""
+    """Return the check `ways_clear`: the straight way home from `position` [rad or m], (joints,), is clear."""
     code = "ways_clear"
     try:
         ((_, leg),) = PointToPointPlan(Destination.HOME).legs(model, position, limits)

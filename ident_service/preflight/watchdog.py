@@ -94,7 +94,7 @@ def watchdogs_of(arm: Arm, model: ArmModel) -> tuple[Watchdog, ...]:
 def watchdog_check(
     arm: Arm, model: ArmModel, session: Session, setpoint_at: Callable[[float], Setpoint], moving: int | None = None
 ) -> Check:
-    """Withhold what each watchdog watches; return whether the drives stop in time as a check. The arm is off then.
+    """Withhold what each watchdog watches; return a check of whether the drives stop in time; the arm is off then.
 
     What one kind of watchdog watches is withheld after the other, and everything else goes on: a drive that stops for
     another reason has not proven its watchdog. So do the closed loop and its guard, for the joints whose drives have

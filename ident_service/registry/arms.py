@@ -72,12 +72,12 @@ def know_shipped(db: Database) -> None:
 
 
 def arm_names(db: Database) -> list[Row]:
-    """Return name, source, folder and description data of every arm."""
+    """Return the rows of all arms by name: source, folder, short description, hash, when and by whom added."""
     return db.rows("SELECT name, source, folder, description, sha256, added, added_by FROM arms ORDER BY name")
 
 
 def known_arm(db: Database, state: Path, name: str) -> KnownArm:
-    """Return the arm of this name with its description, loaded now; raise UnknownId where there is none.
+    """Load the description of the arm of this name, renew the registry's row, return the arm; raise UnknownId for none.
 
     Raises:
         UnknownId: there is none.

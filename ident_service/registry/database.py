@@ -430,7 +430,7 @@ class Database:
         return row
 
     def newest(self, table: str, what: str, at: str, arm: str | None, before: str | None, most: int) -> list[Row]:
-        """Return rows, or those of an arm, the newest first.
+        """Return at most `most` rows, or those of an arm, the newest first, from the one after the row of id `before`.
 
         Args:
             table: table of the rows.

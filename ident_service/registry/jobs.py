@@ -129,7 +129,7 @@ def enter_key(db: Database, who: str, key: str, request: str, job: str) -> None:
 
 
 def job_of_key(db: Database, who: str, key: str, request: str) -> Row | None:
-    """Return the job that a request with an idempotency key has made within a day, or None.
+    """Return the job that this key made within a day, or None; raise AlreadyThere if that was for another request.
 
     Raises:
         AlreadyThere: the key was used to ask for something else.

@@ -34,7 +34,7 @@ _RECORDING = ".mcap"
 
 
 def index_run(db: Database, state: Path, run: str) -> Row:
-    """Verify a run's folder and enter it, its recordings and parameters in the registry, also again; return the row.
+    """Enter a run's folder, recordings and parameters, checked by a manifest if any, in the registry; return the row.
 
     Raises:
         UsageError: no such folder, or no arm in it.
@@ -151,7 +151,7 @@ _TAG = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:+-]{0,39}")
 
 
 def label_run(db: Database, run: str, tags: Sequence[str], words: str, who: str) -> Row:
-    """Give a run its tags and its note, in place of those that it had.
+    """Replace the tags and the note of a run, and return its new labels.
 
     Args:
         db: the registry.

@@ -57,7 +57,7 @@ def add_token(db: Database, name: str, role: Role, by: str) -> str:
 
 
 def revoke_token(db: Database, name: str, by: str) -> None:
-    """Revoke a token.
+    """Revoke the token of this name; raise UnknownId if there is none that counts.
 
     Raises:
         UnknownId: no such token that counts.

@@ -227,7 +227,7 @@ def poor_joints(content: Mapping[str, Any]) -> list[JointAssessment]:
 
 
 def generalises_poorly(content: Mapping[str, Any]) -> bool:
-    """Return whether the worst unseen error is large, and much larger than the fitted one; in motion, if known."""
+    """Return whether the worst unseen error is above 1 % and 1.5 times the fitted one; without standstill, if known."""
     fit, unseen = content.get("fit"), content.get("validation", [])
     if fit is None or not unseen:
         return False

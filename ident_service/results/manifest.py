@@ -55,7 +55,7 @@ def require_folder_of(file: Path) -> None:
 
 @contextmanager
 def atomic_folder(folder: Path) -> Iterator[Path]:
-    """Yield a place to build a folder's content in, which gets its name when the block ends without an error.
+    """Yield a place to build a folder's content in; after the block it becomes the folder, or fills an existing one.
 
     A folder that exists keeps its other files; files of the same name are replaced one by one.
 
@@ -74,7 +74,7 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
 
 @contextmanager
 def staging_beside(folder: Path) -> Iterator[Path]:
-    """Yield a place beside a folder to build its content in; removed with its content after an error.
+    """Yield a new folder beside another to build its content in, for the caller to rename; removed after an error.
 
     Raises:
         UsageError: the folder's place cannot be written, or is a file.
@@ -185,7 +185,7 @@ def file_sha256(path: Path) -> str:
 
 
 def write_manifest(folder: Path) -> None:
-    """Write name and SHA-256 of every file in the folder, for verification on another machine."""
+    """Write the manifest of a folder: name and SHA-256 of every file in it but hidden ones and those in subfolders."""
     manifest = {
         "format": "ident-run",
         "version": 1,

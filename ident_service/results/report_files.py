@@ -99,7 +99,7 @@ def read_evidence_of(results: Results) -> Evidence:
 
 
 def make_report(folder: Path, out: Path | None = None) -> tuple[Path, Assessment]:
-    """Write the report of a folder of results again; return (its page, the assessment on top of it).
+    """Write a results folder's report again, to file `out` or to the folder and its manifest; return (page, verdict).
 
     Args:
         folder: folder made by `ident identify` or `ident simulate`.

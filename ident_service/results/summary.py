@@ -304,7 +304,7 @@ def _torque_constants(estimate: Estimate) -> list[str]:
 
 
 def parameter_table(estimate: Estimate) -> str:
-    """Return every base parameter as text: estimate, standard deviation, verdict (table 6)."""
+    """Return a text table of all base parameters in the estimate's order: value, standard deviation, verdict, unit."""
     lines = [f"{'base parameter':{_WIDTH}s} {'estimate':>12s} {'deviation':>10s}  verdict"]
     for expression, value, deviation, unit, verdict in zip(
         estimate.base.expressions,

@@ -31,7 +31,7 @@ class JobProcess(Protocol):
     """Process of one job."""
 
     def say(self, line: bytes) -> None:
-        """Write one line to the process's standard input without waiting; if it has no room, end the input: a stop."""
+        """Write one line to the process's input without waiting; if that fails, end the input, which stops the job."""
 
     def ended(self) -> bool:
         """Return whether the process has ended."""

@@ -106,7 +106,7 @@ def printed_samples(folder: Path, offset: int) -> tuple[list[dict[str, Any]], in
 
 
 def outcome(output: ProcessOutput, exit_code: int | None, end_reason: str) -> Outcome:
-    """Decide an ended job's state, detail and exit code by its answer's exit code, or by `exit_code` without an answer.
+    """Decide an ended job's state, detail and exit code by its answer, else its exit code, and whether it was to end.
 
     Args:
         output: of the process.
@@ -200,7 +200,7 @@ _ABOUT_A_RUN = frozenset({"report", "verify", "compare", "judge", "feasible"})
 
 
 def register_outputs(db: Database, state: Path, row: Row, by: str) -> None:
-    """Register the run or motion folder that a job's process has left, or raise the drift alarms of its fleet.
+    """Register the run or motion folder that a job left, adding a lacking manifest, or raise the alarms of its fleet.
 
     Args:
         db: the registry.

@@ -184,7 +184,7 @@ class LiveJobs:
         return self._thread.is_alive()
 
     def add(self, live: LiveJob, stops: int | None = None) -> None:
-        """Put a job into the queue, where a stop finds it; refuse it while closing, or after a stop meanwhile.
+        """Put a job into the queue; raise MotionRefused while closing, after a later stop, or if it must not wait.
 
         Args:
             live: the job.
@@ -224,7 +224,7 @@ class LiveJobs:
         self.changed.set()
 
     def waits_for(self, job: str) -> str | None:
-        """Return the id of the job that a queued one waits for; None if it could begin, has begun, or is unknown."""
+        """Return the id of a job that a queued one waits for; None if there is none, or it has begun or is unknown."""
         with self._lock:
             live = self._jobs.get(job)
             if live is None or live.child is not None:
@@ -308,7 +308,7 @@ class LiveJobs:
         return None if live is None or not live.order.moves else live.by
 
     def renew(self, job: str) -> float | None:
-        """Renew a motion's lease; return how long it lasts now [s], None if nothing moves or waits under it."""
+        """Renew a motion's lease; return its length [s], or None for no live motion or one that was asked to end."""
         with self._lock:
             live = self._jobs.get(job)
             if live is None or not live.order.moves or live.end_reason:
@@ -435,7 +435,7 @@ class Engine:
         self.beat = now()
 
     def start(self, first: Callable[[], Any] = lambda: None) -> None:
-        """Mark the jobs that were interrupted, then begin to run the queue; returns at once.
+        """Mark interrupted jobs, requeue waiting computations, then begin to run the queue; returns at once.
 
         Args:
             first: function that the queue's thread calls before it begins anything.
@@ -456,7 +456,7 @@ class Engine:
 
     @property
     def healthy(self) -> bool:
-        """Return whether both threads run, the queue's within 30 s, and no job's end waits to be registered."""
+        """Return whether both threads run, the queue's loop within 30 s, and no job's end waits to be registered."""
         alive = self._thread.is_alive() and self.live.healthy
         return alive and self._now() - self.beat < 30.0 and not any(one.unentered for one in self.live.entered())
 
@@ -519,7 +519,7 @@ class Engine:
         self.audit.note(by, "job cancelled", job)
 
     def stop(self, arm: str | None, by: str) -> dict[str, list[str]]:
-        """Ask for a controlled stop of an arm, or all, whoever moves it; return `arms` reached and `jobs` ended.
+        """Ask for a controlled stop of an arm, or all if None, whoever moves it; return the `arms` and `jobs` reached.
 
         Waits for nobody: the word to our own children is a line in a pipe, the control file is memory, and what the
         audit trail says of it is entered later.
@@ -546,7 +546,7 @@ class Engine:
         return Progress(found.phase, None, None) if self.live.end_reason(row["id"]) else found
 
     def moving(self) -> list[str]:
-        """Return the names of the arms that any process moves."""
+        """Return the names of the arms that any process moves or holds."""
         return moving_arms(self.state)
 
     def begin_closing(self) -> None:

@@ -97,7 +97,7 @@ def conclude(db: Database, row: Row, verdict: Verdict, now: float) -> None:
 def enter_concluded(
     db: Database, arm: str, against: int, recorded: str, run: str, verdict: Verdict, begun: float, by: str, now: float
 ) -> str:
-    """Enter a re-identification done at a terminal with its verdict, as `conclude` does; return its new id.
+    """Enter a re-identification done at a terminal and conclude it by its verdict (`conclude`); return its new id.
 
     Args:
         db: the registry.

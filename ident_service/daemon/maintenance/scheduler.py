@@ -67,7 +67,7 @@ class MaintenanceScheduler:
             self._webhook.close()
 
     def look(self) -> None:
-        """Do one pass: mark what is due, advance re-identifications, begin what may begin, send notices."""
+        """Do one pass: mark what is due, advance re-identifications, begin those allowed (arms move), send notices."""
         now = self._now()
         mark_due(self._db, now)
         self.reidentifications.advance()

@@ -78,7 +78,7 @@ class Webhook:
         self._thread.start()
 
     def send(self, kind: str, at: float, data: Mapping[str, Any]) -> str:
-        """Write a notice into the registry, from where it is sent later, and return its id; never waits.
+        """Write a notice into the registry, from where a thread sends it later, and return the notice's id.
 
         Args:
             kind: `arm.due` and so on.

@@ -210,13 +210,13 @@ def resume(service: Serving, who: Operator, arm: ArmName) -> answers.AskedAnswer
 
 @router.post("/arms/{arm}/finish")
 def finish(service: Serving, who: Operator, arm: ArmName) -> answers.AskedAnswer:
-    """Finish a run early; the arm goes back to where it stood, and the run is done."""
+    """Finish a run early: the arm goes back to where it stood; return whether a process has the arm."""
     return _ask(service, who.name, arm, "finish")
 
 
 @router.post("/arms/{arm}/supported")
 def supported(service: Serving, who: Operator, arm: ArmName, body: Support) -> answers.AskedAnswer:
-    """Confirm that the arm, which is held after a stop, is supported or home: it is then let down."""
+    """Confirm that the held arm is supported or home, so that it is let down; return whether a process has the arm."""
     name = known.known_arm(service.db, service.state, arm).name
     if body.confirm != name:
         raise MotionRefused(f"confirm that {name} is supported by its name, typed by a person who sees it")
@@ -294,7 +294,7 @@ def delete_arm(service: Serving, who: Operator, arm: ArmName, anyway: answers.An
 
 @router.post("/descriptions/new")
 def describe(service: Serving, _: Operator, body: NewDescription) -> NewDescriptionAnswer:
-    """Write a first description of an arm from its URDF and meshes; nothing is kept."""
+    """Return a first description of an arm, written from its URDF and meshes; nothing is kept."""
     if body.urdf not in body.files:
         raise UsageError(f"{body.urdf!r} is not among the files; send the URDF with its meshes")
     with service.checks.place(), TemporaryDirectory(prefix="ident-new-") as place:

@@ -209,7 +209,7 @@ def list_maintenance(
 def add_maintenance(service: Serving, who: Operator, arm: ArmName, body: Event) -> EventAnswer:
     """Enter maintenance that was done; re-identifications that are scheduled after maintenance fall due.
 
-    What is scheduled after it falls due, and may begin by itself where that is allowed.
+    They may begin by themselves where that is allowed.
     """
     row = planned.add_event(service.db, _arm(service, arm), body.what, body.note, who.name, time.time())
     return EventAnswer(**row)

@@ -157,7 +157,7 @@ def motion_svg(service: Service, arm: str, motion: str) -> str:
 
 
 def extent(service: Service, arm: str, motion: str, speed: float) -> Any:
-    """Return how far, how fast and how long an arm goes along a motion (`MotionExtent`); None where nobody can say."""
+    """Return how far, fast and long an arm goes along a motion (`MotionExtent`); None where that cannot be computed."""
     from ident_service.operations.arm_pictures import motion_extent
 
     try:

@@ -350,7 +350,7 @@ def trend(service: Serving, who: Viewer, arm: ArmName) -> Response:
 
 
 def trends(sets: list[tuple[Row, IdentifiedSet]], reference: str | None) -> list[dict[str, Any]]:
-    """Return a row per base parameter of the newest set: values over the runs, change since the accepted set.
+    """Return a row per base parameter of the newest set, with its change since the accepted set; largest change first.
 
     Args:
         sets: rows of runs and their parameters, the earliest first.

@@ -293,7 +293,7 @@ class Pair:
 
     @property
     def verdict(self) -> Verdict:
-        """Return `changed`, `unchanged` or `impossible`; the last also where friction of another shape was left out."""
+        """Return `changed`, `unchanged` or `impossible`; the last, too, where friction left out could hide a change."""
         if self.drift is None or (self.drift.verdict == "unchanged" and self.other_shape):
             return "impossible"
         return self.drift.verdict

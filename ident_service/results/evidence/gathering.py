@@ -302,7 +302,7 @@ class Welch:
         self._window = np.hanning(self.length + 1)[:-1]
 
     def add(self, values: Array, *, opens: bool = False) -> None:
-        """Add the next samples, shape (series, samples), to spectrum and correlation; after a gap, with `opens`."""
+        """Add the next samples, (series, samples), to spectrum and correlation; `opens` says a gap lies before them."""
         self._waiting = values if opens else np.hstack([self._waiting, values])
         self._samples += values.shape[1]
         half = self.length // 2

@@ -118,7 +118,7 @@ def _name(canvas: Canvas, name: str) -> None:
 
 
 def torque_figures(evidence: Evidence, recording: int, mechanism: Chain | None = None) -> list[Figure]:
-    """Draw measured torque, predicted torque and residual over a recording, one figure per joint."""
+    """Draw measured torque, predicted torque and residual over the recording of this index, one figure per joint."""
     return [_torque_figure(evidence, recording, joint, mechanism) for joint in range(len(evidence.joints))]
 
 

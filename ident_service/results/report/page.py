@@ -70,7 +70,7 @@ def joint_rule() -> str:
 
 
 def parameter_table(evidence: Evidence, parameters: ParameterFile) -> Table:
-    """Return every base parameter, the least known first: the chosen estimate, deviation, verdict, the other estimates.
+    """Return a table of all base parameters, least known first: chosen estimate, deviation, verdict, other estimates.
 
     The deviation is the unconstrained fit's, whose column therefore stands beside it where another one was chosen.
     """

@@ -55,7 +55,7 @@ class Table:
 
     @property
     def numbers(self) -> list[bool]:
-        """Return whether each column holds numbers."""
+        """Return for each column whether any of its cells holds a number."""
         return [any(row[k].value is not None for row in self.rows) for k in range(len(self.heads))]
 
     @property

@@ -60,7 +60,7 @@ _CERTIFIED = "parameters.json has a certificate of that: `ident verify --arm` ch
 
 
 def simulation_notice(evidence: Evidence, config: ArmConfig) -> str:
-    """Return the notice that recordings are of a simulated arm, or may be; empty where they are of a real one."""
+    """Return the notice that recordings are of a simulated arm, or may be; empty where nothing says so."""
     drivers = {one.driver for one in evidence.recordings}
     if "simulated" in drivers:
         return SIMULATED
