@@ -259,7 +259,7 @@ class Arm(ABC):
         return ()
 
     def unconfirmed(self) -> tuple[str, ...]:
-        """Return in words which drives did not confirm at the last closing that they are off, and why; empty if none.
+        """Describe drives that did not confirm at closing that they are off, or had restarted; empty if it cannot tell.
 
         One of these may have power, or will miss its host. Also which have restarted while the arm was open, as it may
         have shown as silence only. Empty where nothing is to be told, and for drivers that cannot tell.
@@ -290,7 +290,7 @@ class Arm(ABC):
 
     @abstractmethod
     def reset(self) -> None:
-        """Clear the faults that drives have latched, their own, an emergency stop or a watchdog; energises nothing.
+        """Clear latched faults, emergency stops and watchdogs of drives; energises nothing; DriverError while enabled.
 
         For a person who knows why; no loop calls it. Nothing is energised by it, and an axis that is braked stays
         braked: an arm without brakes must not fall because a fault is forgotten. Without anything latched it does

@@ -170,7 +170,7 @@ class Drives:
 
     @property
     def latched(self) -> tuple[int, ...]:
-        """Return the axes that can be enabled again only after `reset`."""
+        """Return the indices of the axes that can be enabled again only after `reset`."""
         return tuple(np.flatnonzero(self._trips & int(AxisStatus.FAULT | AxisStatus.EMERGENCY_STOP)).tolist())
 
     def reset(self) -> None:
@@ -179,7 +179,7 @@ class Drives:
         self._silent = 0
 
     def enable(self) -> None:
-        """Energise without torque, and clear the watchdog."""
+        """Energise without torque, and clear all that is latched, and the watchdog."""
         self._forget()
         self._trips[:] = 0
         self._braked[:] = 0

@@ -102,7 +102,7 @@ class AnsweringNode(Protocol):
 
 
 def settle_uncertain(nodes: Iterable[AnsweringNode], tell: Callable[[EventCode, int, str], None]) -> int:
-    """Count uncertain answers at the end of a cycle as the latest request's or as late; return how many nodes answered.
+    """Count uncertain answers at a cycle's end as the latest request's, or late; return how many were the latest's.
 
     Args:
         nodes: of one bus.

@@ -469,7 +469,7 @@ class CanopenArm(Arm):
         self._enabled = buses.enabled = True
 
     def reset(self) -> None:
-        """Clear the faults that drives have latched; nothing is energised.
+        """Clear the faults that drives have latched; energises nothing; DriverError while enabled, or if one stays.
 
         Raises:
             DriverError: not open, enabled, or a fault stays because its cause does.
@@ -555,7 +555,7 @@ class CanopenArm(Arm):
             self._stop.give(self._buses, kind)
 
     def close(self) -> None:
-        """Stop the drives, end their supervision of the host and close the buses; any number of times.
+        """Stop the drives, end the supervision of the host in those that are off, close the buses; any number of times.
 
         A quick stop is not cut short by it: drives that are told to let go in the midst of one would let the arm fall.
         The same holds for drives that were found holding the arm in quick stop, unless they have been told to let go.
@@ -571,7 +571,7 @@ class CanopenArm(Arm):
         self._session.close()
 
     def unconfirmed(self) -> tuple[str, ...]:
-        """Return in words which drives did not confirm at the last closing that they are off; empty if all did."""
+        """Describe drives that at closing were neither off nor in quick stop, did not answer, or had restarted."""
         return tuple(self._unconfirmed)
 
     def _leave(self, buses: Buses) -> None:

@@ -132,7 +132,7 @@ class Pdo:
 
     @property
     def timing(self) -> Write:
-        """Return the download of the timer, which may be left at 0 where the drive has none."""
+        """Return the download of a TPDO's event timer or an RPDO's deadline [ms]; its value is 0 for none."""
         return Write(self._entry(4), self.timer)
 
     def _entry(self, which: int, sub: int | None = None) -> Entry:
@@ -227,7 +227,7 @@ class BusProfile:
         return found
 
     def identifiers(self, node: int) -> list[Write]:
-        """Return the downloads of the COB-IDs of SYNC and emergencies; a drive that lacks an entry follows CiA 301."""
+        """Return the downloads of the COB-IDs of SYNC and emergencies, and of the emergencies' inhibit time."""
         return [
             Write(od.SYNC_COB_ID, SYNC, _NO_REMOTE),
             Write(od.EMERGENCY_COB_ID, EMERGENCY + node, _NO_REMOTE),

@@ -155,7 +155,7 @@ class Objects:
             return False
 
     def ensure(self, write: Write) -> None:
-        """Write an entry where it differs from a value, and read it back; raises as `set`, also without the entry."""
+        """Write an entry unless it holds the value, and read it back; raises as `set`, also where it is missing."""
         if not optional(self.holds, write):  # setting a missing entry raises the error
             self.set(write)
 

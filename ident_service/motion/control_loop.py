@@ -113,7 +113,7 @@ class Loop:
         self._hold_speed = HOLD_SPEED * self.limits.velocity
 
     def run(self, target: Vector, first: Sample | None = None) -> None:
-        """Run control cycles until the state is DONE, or STOPPED and the hold over; raises ArmFault to end torque.
+        """Run cycles until DONE, or STOPPED and the hold or lowering over; ArmFault where torque must end now.
 
         Args:
             target: target of the first cycle, which holds the arm where it stands, shape (joints,): torque [N m or N],

@@ -76,7 +76,7 @@ LONGEST_GAP = 20  # periods without a cycle, in which the arm is not supervised 
 
 
 def longest_stall(described: float | None, period: float, watchdogs: Iterable[Watchdog]) -> float:
-    """Return the longest tolerated stall [s]: described or default, capped by half of each watchdog and a silent gap.
+    """Return the longest tolerated stall [s]: `described` or default, at most half of any watchdog and 19 periods.
 
     Args:
         described: `control.longest_stall` of the arm's description [s].

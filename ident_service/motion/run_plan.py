@@ -112,7 +112,7 @@ class PointToPointPlan:
         """Do nothing: home is inside the limits by the description's own check, as is the nearest posture inside."""
 
     def admits(self, model: ArmModel, position: Vector, limits: MotionLimits) -> MotionLimits:
-        """Return limits that include where the arm stands; MotionRefused too far outside, or with nothing to leave."""
+        """Return limits widened to where the arm stands; MotionRefused if too far outside, or nothing is to be left."""
         require_near(position, limits, model.chain.names)
         if self.destination is Destination.INSIDE and not position_limit_violations(
             position, limits, model.chain.names

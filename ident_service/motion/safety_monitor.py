@@ -129,7 +129,7 @@ class MonitoredSample:
 
 
 def checks(seen: MonitoredSample, limits: MotionLimits) -> Iterator[Check]:
-    """Yield all checks of a sample, each with the joints that it hits; those for untrustworthy data come first."""
+    """Yield all checks of a sample, each with a mask that may be empty; those for untrustworthy data come first."""
     yield from _what_cannot_be_believed(seen, limits)
     yield from _quick_stop_checks(seen)
     yield from _what_must_end(seen, limits)

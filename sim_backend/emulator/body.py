@@ -189,7 +189,7 @@ class Body:
                 self.watch(end)
 
     def support(self, now_ns: int) -> None:
-        """Hold the arm where it stands, at rest, until all motors are powered and given torque again."""
+        """Hold the arm where it stands, at rest, until all motors are powered and one of them is given torque again."""
         if not self.supported:
             self.advance(now_ns)
             self.plant.rest()

@@ -71,12 +71,12 @@ class Emulator:
 
     @property
     def gone(self) -> bool:
-        """Return whether a fault has taken the bus."""
+        """Return whether a `bus_gone` fault acts, by which no frame gets through."""
         return any(fault.kind == "bus_gone" for fault in self._injection.active)
 
     @property
     def states(self) -> tuple[str, ...]:
-        """Describe the state of each drive, in words."""
+        """Describe the state of each drive, then of each companion, a safety puck say, in words."""
         drives = ("dead" if self._injection.dead(drive) else face.state for drive, face in enumerate(self.faces))
         return (*drives, *(companion.state for companion in self.companions))
 
@@ -97,7 +97,7 @@ class Emulator:
 
     @property
     def next_deadline_ns(self) -> int | None:
-        """Return when `tick` has something to do [ns]; None for never."""
+        """Return when `tick` has something to do [ns], a drive's timer or a fault; None for never."""
         if self._deadline is not None:
             return self._deadline[0]
         times = [begin for begin, _, _ in self._to_begin] + [end for end, _ in self._to_end]
