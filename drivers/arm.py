@@ -302,7 +302,7 @@ class Arm(ABC):
 
     @abstractmethod
     def exchange(self, torque: Vector | None) -> Sample:
-        """Exchange one cycle with all axes: send the torque, return the sample.
+        """Wait for the next cycle of all axes, send the torque, or none for None, and return the cycle's sample.
 
         Args:
             torque: torque that acts from this cycle's stamp on [N m or N], shape (joints,); None reads without a
@@ -318,7 +318,7 @@ class Arm(ABC):
         """
 
     def exchange_position(self, position: Vector) -> Sample:
-        """Exchange one cycle with axes that close the position loop by themselves: send positions, return the sample.
+        """Wait for the next cycle, send positions to axes that close the position loop, and return the sample.
 
         Args:
             position: position of each joint one cycle from here [rad or m], shape (joints,).

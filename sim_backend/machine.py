@@ -408,7 +408,7 @@ class SimulatedHardware:
 
     @property
     def enabled(self) -> bool:
-        """Return whether the host has energised the drives."""
+        """Return whether the host has energised the drives since its last stop; True also once they have tripped."""
         return self._drives.on
 
     @property
@@ -461,7 +461,7 @@ class SimulatedHardware:
         self._drives.release(kind)
 
     def cycle(self, torque: Vector | None) -> Reading:
-        """Begin a period with a frame, with a torque or without, and return the reading at its stamp.
+        """Begin a period with a frame, with a torque or without; return its reading, or DriverError if the bus is gone.
 
         Args:
             torque: finite [N m or N], shape (joints,), or None to look.

@@ -376,7 +376,7 @@ class BarrettArm(Arm):
             raise ActionNeeded(f"the pendant shows {bus.codec.safety.pendant}; {_SHIFT_IDLE}")
 
     def exchange(self, torque: Vector | None) -> Sample:
-        """Exchange one cycle, with a torque clipped to its limits or none; return the sample.
+        """Wait for the next cycle, send the torque clipped to its limits, or none for None, and return the sample.
 
         Raises:
             DriverError: as in the contract; also an arm that is looked at and has been activated.

@@ -440,7 +440,7 @@ class CanopenArm(Arm):
         return tuple(one for codec in codecs for one in controller_checks(codec.profile.bus.channel, codec.controller))
 
     def enable(self) -> None:
-        """Energise all drives together with zero torque, through the states of CiA 402.
+        """Energise all drives together, with zero torque or in place; DriverError if one does not follow in time.
 
         Drives that hold the arm in quick stop (605Ah of 5 to 8) go on holding it until all others are ready, too.
 
@@ -482,7 +482,7 @@ class CanopenArm(Arm):
         )
 
     def exchange(self, torque: Vector | None) -> Sample:
-        """Exchange one cycle, with a torque clipped to its limits or none; return the sample.
+        """Wait for the next cycle, send the torque clipped to its limits, or none for None, and return the sample.
 
         Raises:
             DriverError: as in the contract.
@@ -502,7 +502,7 @@ class CanopenArm(Arm):
         return self._exchanged(buses, sends=torque is not None)
 
     def exchange_position(self, position: Vector) -> Sample:
-        """Exchange one cycle with drives that are given positions, which are sent in counts; return the sample.
+        """Wait for the next cycle, send positions, as counts, to drives that are given these; return the sample.
 
         Raises:
             DriverError: as in the contract.

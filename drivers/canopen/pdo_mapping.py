@@ -235,7 +235,7 @@ class BusProfile:
         ]
 
     def heartbeat(self, node: int) -> Write:
-        """Return the download of a drive's heartbeat period; a guarded drive cannot send one (CiA 301, 7.2.8.3.1)."""
+        """Return the download of a drive's heartbeat period, 0 for a guarded one, which can send none (CiA 301)."""
         return Write(od.HEARTBEAT_PRODUCER, 0 if node in self.guarded else _whole(self.heartbeat_drives, 1e-3))
 
     @property

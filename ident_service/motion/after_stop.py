@@ -65,7 +65,7 @@ def joints_with_weight(model: ArmModel, limits: MotionLimits) -> tuple[str, ...]
 
 
 def after_stop(model: ArmModel, limits: MotionLimits) -> StopSecuring:
-    """Return how the arm is secured after a stop: as configured, else by its brakes; raises where joints would fall.
+    """Return how a stopped arm is secured: `hold` or `lower` if set, else brakes; MotionRefused if joints would fall.
 
     Args:
         model: model with prior parameters.

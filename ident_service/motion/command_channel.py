@@ -289,7 +289,7 @@ class ControlFile:
         return self._memory[_SUPPORTED] != 0
 
     def confirm_support(self) -> None:
-        """Confirm for a person who sees it that the held arm is supported or home, whereupon the loop lowers it.
+        """Confirm that the held arm is supported or home, so that the loop lowers it; UsageError if none is held.
 
         Raises:
             UsageError: the arm does not wait for it; confirmed beforehand, it would release an arm that still moves.
@@ -472,7 +472,7 @@ class SupervisedCommands:
         return self._controls.homing
 
     def tell_homing(self, stage: Homing) -> None:
-        """Set the stage of leading a held arm home; while it is `GOING`, `lease_ok` checks that lease."""
+        """Set the stage of leading a held arm home; while `GOING`, `lease_ok` checks that requester's lease only."""
         self._controls.tell_homing(stage)
 
     @property

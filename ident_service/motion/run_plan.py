@@ -77,7 +77,7 @@ class ExcitationPlan:
         return limits
 
     def legs(self, model: ArmModel, start: Vector, limits: MotionLimits) -> Sequence[Leg]:
-        """Return approach, excitation and return as (state, slowed reference) pairs; MotionRefused if not clear."""
+        """Return approach, excitation, return as (state, slowed reference) pairs; MotionRefused if impossible."""
         exciting = PathReference(self.excitation.path)
         begin, end = exciting.at(0.0), exciting.at(exciting.duration)
         there, back = (
@@ -121,7 +121,7 @@ class PointToPointPlan:
         return relaxed_limits(position, limits)
 
     def legs(self, model: ArmModel, start: Vector, limits: MotionLimits) -> Sequence[Leg]:
-        """Return one (state, slowed reference) pair to home or just inside the limits; MotionRefused if not clear."""
+        """Return one (state, slowed reference) pair to home or just inside the limits; MotionRefused if impossible."""
         end = limits.home if self.destination is Destination.HOME else just_inside(start, limits)
         way = plan_reduced_trajectory(rest(start), rest(end), relaxed_limits(start, limits))
         try:

@@ -320,7 +320,7 @@ class PowerStage:
         return False
 
     def reset_fault(self) -> None:
-        """Leave the state `fault` (transition 15): the cause is gone, and a host has reset it."""
+        """Enter `switch on disabled` (transition 15): the cause of a fault is gone, and a host has reset it."""
         self.state = PowerState.SWITCH_ON_DISABLED
 
     def disable_voltage(self) -> None:
@@ -329,7 +329,7 @@ class PowerStage:
             self._to(target)
 
     def quick_stop(self) -> None:
-        """Start a quick stop (transition 11), or its counterpart in another state; option code 605Ah."""
+        """Brake where operation is enabled (605Ah 0: switch off at once), else go where that command leads."""
         if self.state is PowerState.OPERATION_ENABLED:
             if self._node.objects.number(0x605A) == 0:
                 self._to(PowerState.SWITCH_ON_DISABLED)

@@ -129,7 +129,7 @@ class Emulator:
         sender: int | None = None,
         answer: Callable[[list[Sent]], object] | None = None,
     ) -> list[Sent]:
-        """Deliver a frame on a bus to all drives that listen to it; return the frames that they send, in order.
+        """Deliver a frame to a bus's devices; return the frames they send, but answers to a SYNC to `answer`, if given.
 
         Args:
             bus: index of the bus.
@@ -205,7 +205,7 @@ class Emulator:
         self._deadline = None
 
     def go_on(self, now_ns: int) -> None:
-        """Compute the arm's next step in advance; take it at once where its cycle is late, by `Body.overdue_ns`.
+        """Compute the arm's next step in advance, or advance the arm now where its cycle is overdue.
 
         Moving the arm takes longest; without this the answers to each cycle would come later, and late ones late.
         """
@@ -228,7 +228,7 @@ class Emulator:
         self._deadline = None
 
     def add_configured(self, faults: Iterable[DriveFault]) -> None:
-        """Schedule faults counted from the first SYNC, as those of the configuration."""
+        """Schedule faults that are counted from the next SYNC, besides those of the configuration."""
         self._configured += tuple(faults)
 
     def clear(self, now_ns: int) -> None:

@@ -303,7 +303,7 @@ def emulate(
     stop_requested: Callable[[], bool] = lambda: False,
     commands: Callable[[], str | None] = lambda: None,
 ) -> Emulated:
-    """Run the drives of an arm on its configured interfaces until told to stop, and return a summary.
+    """Run the drives of an arm on its configured interfaces for `seconds` or until told to stop; return a summary.
 
     Args:
         config: of the arm.

@@ -115,7 +115,7 @@ class EmulatedPuck:
 
     @property
     def released(self) -> bool:
-        """Return whether a host has led the arm and has taken it to IDLE: then a person supports it."""
+        """Return whether the arm is IDLE and its host has asked for that since it was active, or it never was."""
         return self._safety.mode is SafetyMode.IDLE and self._safety.lowered_by_host
 
     @property
