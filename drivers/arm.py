@@ -259,10 +259,11 @@ class Arm(ABC):
         return ()
 
     def unconfirmed(self) -> tuple[str, ...]:
-        """Describe drives that did not confirm at closing that they are off, or had restarted; empty if it cannot tell.
+        """Describe drives that did not confirm at closing that they are off, or had restarted; empty if unknown.
 
-        One of these may have power, or will miss its host. Also which have restarted while the arm was open, as it may
-        have shown as silence only. Empty where nothing is to be told, and for drivers that cannot tell.
+        One that is not off may have power, or will miss its host; a restart while the arm was open may have shown as
+        silence only. Empty where nothing is to be told, and for drivers that cannot tell; a drive that was told to hold
+        the arm in quick stop is left out.
         """
         return ()
 

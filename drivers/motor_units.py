@@ -87,7 +87,7 @@ class Coordinates:
         return [round(turn) + zero for turn, zero in zip(motors.tolist(), self.zero, strict=True)]
 
     def count_limits(self, lowest: Vector, highest: Vector) -> list[tuple[int, int] | None]:
-        """Return each motor's lowest and highest nearest counts between joint positions; None for one without limits.
+        """Return each motor's lowest and highest counts, rounded, between joint positions; None without limits.
 
         Args:
             lowest: [rad or m], shape (n,); not finite where a joint has no limit.

@@ -461,7 +461,7 @@ class SimulatedHardware:
         self._drives.release(kind)
 
     def cycle(self, torque: Vector | None) -> Reading:
-        """Begin a period with a frame, with a torque or without; return its reading, or DriverError if the bus is gone.
+        """Begin a period with a frame, with or without torque, and return its reading; DriverError if the bus is gone.
 
         Args:
             torque: finite [N m or N], shape (joints,), or None to look.

@@ -101,7 +101,7 @@ class JointEncoders:
         self._without = dict.fromkeys(self._radians, 0)
 
     def update(self, pucks: Sequence[MotorPuck], position: Vector) -> tuple[Vector | None, list[AxisEvent]]:
-        """Return joint positions by the encoders [rad], and events of joints just found off their motors or unread.
+        """Return joint positions by the encoders [rad], and events of joints newly off their motors or unread.
 
         Args:
             pucks: pucks at the end of a cycle.
@@ -251,7 +251,7 @@ class BarrettArm(Arm):
         return self._session.logged()
 
     def open(self) -> None:
-        """Lock and open the bus, wake, check and limit the pucks, all idle, and find where the arm stands.
+        """Lock and open the bus, wake, check, idle and limit the pucks, and find where the arm stands.
 
         Raises:
             DriverError: the bus is in use, by another host too, or cannot be had; pucks do not answer, or cannot be

@@ -163,7 +163,7 @@ class FrozenEncoderObserver:
         position: Vector,
         feedforward: Vector | float = 0.0,
     ) -> Flags:
-        """Estimate unseen motion; return which joints and multi-joint drives should have moved more than can hide.
+        """Estimate unseen motion; return which joints and multi-joint drives exceed what their encoders can hide.
 
         Args:
             steps: change of each position since the cycle before [rad or m], 0 where it was not measured, shape
@@ -240,9 +240,9 @@ def frozen_encoder_observer(
 
 
 def encoder_coupling(config: ArmConfig) -> Vector | None:
-    """Return the drives' motion per motion of the joints, shape (joints, joints); None where no drive moves several.
+    """Return the encoders' motion per motion of the joints, shape (joints, joints); None without a coupling.
 
-    None where each joint has its own drive. Whether friction and inertia are the drives' (`drive_terms`) is another
+    Without one each joint has its own drive. Whether friction and inertia are the drives' (`drive_terms`) is another
     question: encoders at shared drives count the drives' motion in any case.
     """
     gears = config.transmission
