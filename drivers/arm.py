@@ -189,7 +189,7 @@ class Arm(ABC):
     still_wanted: Callable[[], bool] = staticmethod(lambda: True)
 
     def look(self) -> Arm:
-        """Return a closed arm for the same hardware that can only be observed; not to be opened beside this one.
+        """Return a closed arm to observe the same hardware with, without any command; this arm itself by default.
 
         Of what is returned only `open`, `describe`, `exchange(None)` and `close` are used, and none of them sends a
         command, changes what a drive does or is configured to do, or keeps its watchdog quiet. It may be slower

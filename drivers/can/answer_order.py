@@ -40,7 +40,7 @@ class AnswerOrder:
         self._latest_ns = 0
 
     def take(self, delay_ns: int | None) -> int | None:
-        """Count an answer within its cycle; return how many requests ago its own may have been, None if none is open.
+        """Count an answer; return how many requests ago the one it may answer was, 0 if surely the latest, or None.
 
         Args:
             delay_ns: time since the latest request [ns]; None where it is unknown.

@@ -306,7 +306,7 @@ class BusCodec:
         return [drive.node for drive in self.drives if drive.nmt is None or drive.heartbeat_ns < oldest]
 
     def stale(self) -> list[int]:
-        """Return the nodes whose status report has been missing for longer than its profile allows."""
+        """Return the nodes whose status report has been missing for longer than the profile's `status_timeout`."""
         return [drive.node for drive in self.drives if drive.status_age > self._status_cycles]
 
     def take_events(self) -> list[Event]:

@@ -206,7 +206,7 @@ class BusProfile:
 
     @property
     def status_timeout(self) -> float:
-        """Return how long to wait for a drive's status report [s]: one may be lost, and the next be delayed."""
+        """Return after how long a status report counts as missing [s]: 2.5 times its period or longer inhibit time."""
         return _STATUS_PATIENCE * max(self.status_period, self.status_inhibit)
 
     def pdos(self, node: int) -> list[Pdo]:

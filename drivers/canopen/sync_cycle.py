@@ -477,7 +477,7 @@ class EnableSequence:
         return self._target == len(_WAY)
 
     def commands(self, now_ns: int) -> list[tuple[int, int]]:
-        """Return (drive number, control word) pairs to send in this cycle; raises on a fault or when time is over.
+        """Return (drive number, control word) pairs to send in this cycle; DriverError on a fault or a step too slow.
 
         Raises:
             DriveFaulted: a drive has a fault; which, and why as far as it is known.

@@ -174,7 +174,7 @@ class Deadlines:
         return self._of.known
 
     def cycle(self, stamp_ns: int, woken_ns: int, doubt_ns: int = 0) -> Fault | None:
-        """Return the fault of a cycle that is late, after a silence or of a jumped stamp, else None; updates lateness.
+        """Judge a cycle's timing; return its fault if it is late, after a silence or its stamp jumped, else None.
 
         Args:
             stamp_ns: of its sample [ns].

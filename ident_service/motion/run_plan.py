@@ -46,13 +46,13 @@ class Plan(Protocol):
         """Return whether the arm is held at the end and secured as after a stop, since nothing may support it there."""
 
     def require_possible(self, model: ArmModel, limits: MotionLimits) -> None:
-        """Raise MotionRefused where the plan is impossible from any start."""
+        """Raise MotionRefused where the plan cannot be followed, wherever the arm stands."""
 
     def admits(self, model: ArmModel, position: Vector, limits: MotionLimits) -> MotionLimits:
         """Return the limits of a run from this position [rad or m], (joints,); MotionRefused if it may not begin."""
 
     def legs(self, model: ArmModel, start: Vector, limits: MotionLimits) -> Sequence[Leg]:
-        """Return (state, reference) pairs from `start` [rad or m], (joints,), in order; MotionRefused if not clear."""
+        """Return (state, reference) pairs from `start`, in order; MotionRefused if one is impossible or not clear."""
 
 
 @dataclass(frozen=True)

@@ -419,7 +419,7 @@ class SafetyMonitor:
         return usable, fault
 
     def torque(self, wanted: Vector) -> tuple[Vector, Fault | None]:
-        """Check a torque; return it limited in size and, but for the first, in rate (0 if refused), and fault or None.
+        """Return the torque limited in size and rate (the first in size only; 0 if refused), and its fault or None.
 
         Args:
             wanted: torque demanded by the controller [N m or N], shape (joints,).
@@ -465,7 +465,7 @@ class SafetyMonitor:
         return leaves, fault
 
     def position(self, wanted: Vector) -> tuple[Vector, Fault | None]:
-        """Check a position for the drives; return it limited in step, or the last one if refused; and fault or None.
+        """Return the position limited in step for the drives (the last one if refused), and its fault or None.
 
         Args:
             wanted: position demanded by the trajectory [rad or m], shape (joints,).
