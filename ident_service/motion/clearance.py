@@ -164,7 +164,7 @@ def motion_stop_clearance(path: Path, limits: MotionLimits, model: ArmModel) -> 
 
 
 def motion_stop_contact(path: Path, limits: MotionLimits, model: ArmModel) -> str | None:
-    """Describe the stop out of a motion in which bodies touch or overlap most, by capsules; None where none touches."""
+    """Describe the sampled stop out of a motion in which capsules around bodies overlap most; None if none touch."""
     nearest = motion_stop_clearance(path, limits, model)
     if nearest.distance > 0.0:
         return None

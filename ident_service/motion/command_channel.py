@@ -459,7 +459,7 @@ class SupervisedCommands:
 
     @property
     def supported(self) -> bool:
-        """Return whether a person has confirmed that the waiting arm is supported or home."""
+        """Return whether a person has confirmed, since the present hold began, that the arm is supported or home."""
         return self._controls.supported
 
     def announce_hold(self) -> None:
@@ -468,7 +468,7 @@ class SupervisedCommands:
 
     @property
     def homing(self) -> Homing:
-        """Return the stage of leading a held arm home."""
+        """Return the stage of leading a held arm home, `NONE` where nobody has asked for that."""
         return self._controls.homing
 
     def tell_homing(self, stage: Homing) -> None:

@@ -65,7 +65,7 @@ class TimedSink:
         return self._sink.error
 
     def put(self, cycle: Cycle) -> bool:
-        """Count a cycle's lateness and computing time, and pass it to the sink; return False where that lags."""
+        """Count a cycle's lateness and computing time, and pass it to the sink; False where that lags or has failed."""
         self.lateness.add(cycle.lateness_ns)
         self.compute.add(cycle.compute_ns)
         return self._sink.put(cycle)
