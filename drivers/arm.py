@@ -189,7 +189,7 @@ class Arm(ABC):
     still_wanted: Callable[[], bool] = staticmethod(lambda: True)
 
     def look(self) -> Arm:
-        """Return a closed arm for the same hardware that can only be observed; not to be opened beside this one.
+        """Return a closed arm to observe the same hardware with, without any command; this arm itself by default.
 
         Of what is returned only `open`, `describe`, `exchange(None)` and `close` are used, and none of them sends a
         command, changes what a drive does or is configured to do, or keeps its watchdog quiet. It may be slower
@@ -259,10 +259,11 @@ class Arm(ABC):
         return ()
 
     def unconfirmed(self) -> tuple[str, ...]:
-        """Return in words which drives did not confirm at the last closing that they are off, and why; empty if none.
+        """Describe drives that did not confirm at closing that they are off, or had restarted; empty if unknown.
 
-        One of these may have power, or will miss its host. Also which have restarted while the arm was open, as it may
-        have shown as silence only. Empty where nothing is to be told, and for drivers that cannot tell.
+        One that is not off may have power, or will miss its host; a restart while the arm was open may have shown as
+        silence only. Empty where nothing is to be told, and for drivers that cannot tell; a drive that was told to hold
+        the arm in quick stop is left out.
         """
         return ()
 
@@ -290,7 +291,7 @@ class Arm(ABC):
 
     @abstractmethod
     def reset(self) -> None:
-        """Clear the faults that drives have latched, their own, an emergency stop or a watchdog; energises nothing.
+        """Clear latched faults, emergency stops and watchdogs of drives; energises nothing; DriverError while enabled.
 
         For a person who knows why; no loop calls it. Nothing is energised by it, and an axis that is braked stays
         braked: an arm without brakes must not fall because a fault is forgotten. Without anything latched it does
@@ -302,7 +303,7 @@ class Arm(ABC):
 
     @abstractmethod
     def exchange(self, torque: Vector | None) -> Sample:
-        """Exchange one cycle with all axes: send the torque, return the sample.
+        """Wait for the next cycle of all axes, send the torque, or none for None, and return the cycle's sample.
 
         Args:
             torque: torque that acts from this cycle's stamp on [N m or N], shape (joints,); None reads without a
@@ -318,7 +319,7 @@ class Arm(ABC):
         """
 
     def exchange_position(self, position: Vector) -> Sample:
-        """Exchange one cycle with axes that close the position loop by themselves: send positions, return the sample.
+        """Wait for the next cycle, send positions to axes that close the position loop, and return the sample.
 
         Args:
             position: position of each joint one cycle from here [rad or m], shape (joints,).

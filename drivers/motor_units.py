@@ -87,7 +87,7 @@ class Coordinates:
         return [round(turn) + zero for turn, zero in zip(motors.tolist(), self.zero, strict=True)]
 
     def count_limits(self, lowest: Vector, highest: Vector) -> list[tuple[int, int] | None]:
-        """Return each motor's range of counts while joints are between these positions; None where one is unlimited.
+        """Return each motor's lowest and highest counts, rounded, between joint positions; None without limits.
 
         Args:
             lowest: [rad or m], shape (n,); not finite where a joint has no limit.
@@ -116,7 +116,7 @@ class Coordinates:
         return replace(self, zero=tuple(counts), offset=np.array(position, dtype=float))
 
     def torque_counts(self, torque: Vector) -> tuple[list[int], bool]:
-        """Convert joint torques to each motor's counts, scaled down in its group to the limits; and whether they were.
+        """Convert joint torques to counts of each motor, scaled down by group to the limits; and whether any was.
 
         Args:
             torque: of the joints [N m or N], shape (n,).

@@ -119,7 +119,7 @@ class SimulatedArm(Arm):
         self._machine.enable()
 
     def reset(self) -> None:
-        """Clear the faults that the drives have latched; raises DriverError when not open."""
+        """Clear the faults that the drives have latched; DriverError when not open, enabled, or a cause persists."""
         self._require_open()
         self._machine.reset()
 

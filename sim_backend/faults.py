@@ -124,7 +124,7 @@ class Feedback:
     def receive(
         self, fresh: Vector, status: tuple[int, ...], faults: Sequence[Fault]
     ) -> tuple[Vector, Flags, Counts, tuple[int, ...]]:
-        """Return positions, validity, ages and status words of a cycle, as its faults change them; keeps them.
+        """Return positions, validity, ages and status words of a cycle as its faults show them, and remember them.
 
         Args:
             fresh: positions that the encoders show [rad or m], shape (joints,); kept.

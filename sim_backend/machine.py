@@ -170,7 +170,7 @@ class Drives:
 
     @property
     def latched(self) -> tuple[int, ...]:
-        """Return the axes that can be enabled again only after `reset`."""
+        """Return the indices of the axes that can be enabled again only after `reset`."""
         return tuple(np.flatnonzero(self._trips & int(AxisStatus.FAULT | AxisStatus.EMERGENCY_STOP)).tolist())
 
     def reset(self) -> None:
@@ -179,7 +179,7 @@ class Drives:
         self._silent = 0
 
     def enable(self) -> None:
-        """Energise without torque, and clear the watchdog."""
+        """Energise without torque, and clear all that is latched, and the watchdog."""
         self._forget()
         self._trips[:] = 0
         self._braked[:] = 0
@@ -408,7 +408,7 @@ class SimulatedHardware:
 
     @property
     def enabled(self) -> bool:
-        """Return whether the host has energised the drives."""
+        """Return whether the host has energised the drives since its last stop; True also once they have tripped."""
         return self._drives.on
 
     @property
@@ -461,7 +461,7 @@ class SimulatedHardware:
         self._drives.release(kind)
 
     def cycle(self, torque: Vector | None) -> Reading:
-        """Begin a period with a frame, with a torque or without, and return the reading at its stamp.
+        """Begin a period with a frame, with or without torque, and return its reading; DriverError if the bus is gone.
 
         Args:
             torque: finite [N m or N], shape (joints,), or None to look.

@@ -183,7 +183,7 @@ class PlantProcess:
         self._quiet = self._abandoned = 0  # periods at rest, and without a client
 
     def run(self) -> None:
-        """Serve until parent and client are gone and the arm is at rest."""
+        """Serve until parent and client are gone and the arm rests, or has moved for `PATIENCE` simulated seconds."""
         try:
             while self._client is not None or self._lifeline is not None:
                 self._turn()

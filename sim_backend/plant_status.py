@@ -92,7 +92,7 @@ class PlantStatus:
 
     @property
     def ended(self) -> bool:
-        """Return whether the process has ended by itself."""
+        """Return whether the process has recorded its own end; False while it runs, and if it was killed."""
         return self.state >= PlantState.ENDED_AT_REST
 
     @property
@@ -133,7 +133,7 @@ def decode_status(data: bytes) -> PlantStatus | None:
 
 
 def read_status(path: Path | str) -> PlantStatus:
-    """Read the present status of a plant.
+    """Read the present status of a plant from its file; DriverError if there is none, or none that is whole.
 
     Args:
         path: the file that `driver.status` names, or `/proc/self/fd/N` of anonymous memory.

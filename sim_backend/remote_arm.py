@@ -102,7 +102,7 @@ class PlantLaunch:
         raise DriverError(f"the plant process did not start: {said or 'it said nothing'}")
 
     def end(self) -> None:
-        """Tell the process that it is no longer needed, and wait until the arm is at rest and the process has ended."""
+        """Tell the process to end, and wait until its arm rests and it has; it is killed after 20 s."""
         self._finalizer()
 
     @property
@@ -241,7 +241,7 @@ class RemoteArm(Arm):
         self._enabled = True
 
     def reset(self) -> None:
-        """Clear the faults that the drives have latched; raises DriverError when not open."""
+        """Clear the faults that the drives have latched; DriverError when not open, enabled, or a cause persists."""
         self._require_open()
         self._done(self._ask(wire.Reset(), self._deadline))
 

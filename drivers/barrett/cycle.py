@@ -179,7 +179,7 @@ class PuckCodec:
         return [get(self.safety.node, self._safety.number(name)) for name in ("MODE", "PEN")]
 
     def questions(self) -> list[Frame]:
-        """Return the frames that ask all pucks for MODE and their state, in the order in which they are sent."""
+        """Return the frames that ask all pucks for MODE, those not in torque mode for STAT, the safety puck for PEN."""
         mode = get(self.safety.node, self._safety.number("MODE"))
         pendant = get(self.safety.node, self._safety.number("PEN"))
         frames = [mode]
@@ -220,7 +220,7 @@ class PuckCodec:
         return taken
 
     def forget_events(self) -> None:
-        """Discard all events so far, so that conditions that persist are reported again."""
+        """Discard all events; a controller in trouble is told again at once, stray frames when the next one comes."""
         self._events = []
         self._told.clear()
         if self.controller in LEFT_NORMAL:
@@ -329,7 +329,7 @@ class PuckCodec:
 
 
 def axis_status(puck: MotorPuck, safety: SafetyPuck) -> AxisStatus:
-    """Return a puck's status as fieldbus-independent flags: faults, emergency stop, POWERED in torque mode, or IDLE."""
+    """Return a puck's status flags: POWERED alone where it follows torques, else IDLE and what is wrong."""
     found = AxisStatus(0)
     if safety.mode == SafetyMode.ESTOP:
         found |= AxisStatus.EMERGENCY_STOP

@@ -101,7 +101,7 @@ class JointEncoders:
         self._without = dict.fromkeys(self._radians, 0)
 
     def update(self, pucks: Sequence[MotorPuck], position: Vector) -> tuple[Vector | None, list[AxisEvent]]:
-        """Return joint positions by the encoders [rad], and events of joints off their motors or with an encoder lost.
+        """Return joint positions by the encoders [rad], and events of joints newly off their motors or unread.
 
         Args:
             pucks: pucks at the end of a cycle.
@@ -251,7 +251,7 @@ class BarrettArm(Arm):
         return self._session.logged()
 
     def open(self) -> None:
-        """Lock and open the bus, wake, check and limit the pucks, and find where the arm stands.
+        """Lock and open the bus, wake, check, idle and limit the pucks, and find where the arm stands.
 
         Raises:
             DriverError: the bus is in use, by another host too, or cannot be had; pucks do not answer, or cannot be
@@ -310,7 +310,7 @@ class BarrettArm(Arm):
         return budget(self._driver, self._config.control.rate if rate is None else rate)
 
     def setup_checks(self) -> tuple[SetupCheck, ...]:
-        """Return what pucks report of themselves beside what is expected, and a host's CAN controller in trouble."""
+        """Return what pucks of the open arm report beside the expected, and a check of a CAN controller in trouble."""
         return self._checks + controller_checks(self._driver.bus.channel, self._require_open().codec.controller)
 
     def watchdogs(self) -> tuple[Watchdog, ...]:
@@ -354,7 +354,7 @@ class BarrettArm(Arm):
         self._enabled = True
 
     def reset(self) -> None:
-        """Clear the errors of motor pucks; DriverError if one stays, or the pendant shows what only a person clears.
+        """Clear the errors of motor pucks; DriverError while enabled, if one stays, or the pendant shows a fault.
 
         Raises:
             DriverError: not open, enabled, an error stays because its cause does, or the pendant shows a fault.
@@ -376,7 +376,7 @@ class BarrettArm(Arm):
             raise ActionNeeded(f"the pendant shows {bus.codec.safety.pendant}; {_SHIFT_IDLE}")
 
     def exchange(self, torque: Vector | None) -> Sample:
-        """Exchange one cycle, with a torque clipped to its limits or none; return the sample.
+        """Wait for the next cycle, send the torque clipped to its limits, or none for None, and return the sample.
 
         Raises:
             DriverError: as in the contract; also an arm that is looked at and has been activated.
@@ -427,7 +427,7 @@ class BarrettArm(Arm):
         self._session.close()
 
     def unconfirmed(self) -> tuple[str, ...]:
-        """Return in words which pucks did not report at the last closing that they are idle; empty where all did."""
+        """Describe pucks that at the last closing were not known to be idle, or had restarted; empty if none."""
         return self._unconfirmed
 
     def _wait_until_idle(self, bus: PuckBus) -> None:

@@ -40,7 +40,7 @@ class AnswerOrder:
         self._latest_ns = 0
 
     def take(self, delay_ns: int | None) -> int | None:
-        """Count an answer within its cycle; return how many requests ago its own may have been, None if none is open.
+        """Count an answer; return how many requests ago the one it may answer was, 0 if surely the latest, or None.
 
         Args:
             delay_ns: time since the latest request [ns]; None where it is unknown.
@@ -102,7 +102,7 @@ class AnsweringNode(Protocol):
 
 
 def settle_uncertain(nodes: Iterable[AnsweringNode], tell: Callable[[EventCode, int, str], None]) -> int:
-    """Count uncertain answers at the end of a cycle as the latest request's or as late; return how many nodes answered.
+    """Count uncertain answers at a cycle's end as the latest request's, or late; return how many were the latest's.
 
     Args:
         nodes: of one bus.

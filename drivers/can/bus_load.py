@@ -303,7 +303,7 @@ class Budget:
 
     @property
     def remedy(self) -> str:
-        """Return one sentence that says what to do; empty where nothing has to be done."""
+        """Return the remedies as one sentence; empty where the load fits, or no remedy is known."""
         return f"Do one of these: {'; '.join(self.remedies)}." if self.remedies else ""
 
 

@@ -107,7 +107,7 @@ class OrderedLog:
 
 
 def main() -> int:
-    """Write one log of the frame packets on standard input; return 0 when it is complete."""
+    """Write one log of the frame packets on standard input; return 0 when all of them are in it, 1 after an error."""
     _step_back()
     with socket.socket(fileno=sys.stdin.fileno()) as source:
         return _serve(source)

@@ -59,7 +59,7 @@ def from_config(config: ArmConfig, bus_number: int) -> PythonCanLink:
 
 
 def open_bus(bus: CanBus, **more: Any) -> can.BusABC:
-    """Open an interface as it is configured, and only so: python-can's own configuration files are not read.
+    """Open an interface with the options of `bus` and `more` only; python-can's configuration files are not read.
 
     Args:
         bus: the configured one.

@@ -87,7 +87,7 @@ _STATES = {
 
 
 def controller_state_frame(channel: str) -> Frame | None:
-    """Return an error frame if an interface's controller is error-passive or bus-off, None for any other state.
+    """Return an error frame if an interface's controller is error-passive or bus-off; None otherwise, and if unknown.
 
     Args:
         channel: name of the interface.

@@ -394,7 +394,7 @@ def assess(
 
 
 def where(entry: Entry) -> str:
-    """Return an entry as people write it: `6410h:02`."""
+    """Return an entry as people write it: `6410h:02`, or `6410h` for sub-index 0."""
     return f"{entry.index:04X}h" + (f":{entry.sub:02X}" if entry.sub else "")
 
 

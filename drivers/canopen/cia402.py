@@ -214,7 +214,7 @@ def axis_status(status: int, emergency: int = 0) -> AxisStatus:
 
 
 def joint_status(drives: Iterable[AxisStatus]) -> AxisStatus:
-    """Combine the status of the drives that move a joint: powered if all of them are, in trouble if one of them is."""
+    """Combine the status of the drives that move a joint: POWERED if all of them are, any other flag if one has it."""
     powered, trouble = True, AxisStatus(0)
     for word in drives:
         powered = powered and bool(word & AxisStatus.POWERED)
@@ -263,7 +263,7 @@ def abort_words(code: int) -> str:
 
 
 def nmt_words(state: int) -> str:
-    """Describe the NMT state of a heartbeat."""
+    """Describe an NMT state, as heartbeats carry it, in words: `pre-operational`."""
     try:
         return NmtState(state).name.lower().replace("_", "-")
     except ValueError:

@@ -440,7 +440,7 @@ class CanopenArm(Arm):
         return tuple(one for codec in codecs for one in controller_checks(codec.profile.bus.channel, codec.controller))
 
     def enable(self) -> None:
-        """Energise all drives together with zero torque, through the states of CiA 402.
+        """Energise all drives together, with zero torque or in place; DriverError if one does not follow in time.
 
         Drives that hold the arm in quick stop (605Ah of 5 to 8) go on holding it until all others are ready, too.
 
@@ -469,7 +469,7 @@ class CanopenArm(Arm):
         self._enabled = buses.enabled = True
 
     def reset(self) -> None:
-        """Clear the faults that drives have latched; nothing is energised.
+        """Clear the faults that drives have latched; energises nothing; DriverError while enabled, or if one stays.
 
         Raises:
             DriverError: not open, enabled, or a fault stays because its cause does.
@@ -482,7 +482,7 @@ class CanopenArm(Arm):
         )
 
     def exchange(self, torque: Vector | None) -> Sample:
-        """Exchange one cycle, with a torque clipped to its limits or none; return the sample.
+        """Wait for the next cycle, send the torque clipped to its limits, or none for None, and return the sample.
 
         Raises:
             DriverError: as in the contract.
@@ -502,7 +502,7 @@ class CanopenArm(Arm):
         return self._exchanged(buses, sends=torque is not None)
 
     def exchange_position(self, position: Vector) -> Sample:
-        """Exchange one cycle with drives that are given positions, which are sent in counts; return the sample.
+        """Wait for the next cycle, send positions, as counts, to drives that are given these; return the sample.
 
         Raises:
             DriverError: as in the contract.
@@ -555,7 +555,7 @@ class CanopenArm(Arm):
             self._stop.give(self._buses, kind)
 
     def close(self) -> None:
-        """Stop the drives, end their supervision of the host and close the buses; any number of times.
+        """Stop the drives, end the supervision of the host in those that are off, close the buses; any number of times.
 
         A quick stop is not cut short by it: drives that are told to let go in the midst of one would let the arm fall.
         The same holds for drives that were found holding the arm in quick stop, unless they have been told to let go.
@@ -571,7 +571,7 @@ class CanopenArm(Arm):
         self._session.close()
 
     def unconfirmed(self) -> tuple[str, ...]:
-        """Return in words which drives did not confirm at the last closing that they are off; empty if all did."""
+        """Describe drives that at closing were neither off nor in quick stop, did not answer, or had restarted."""
         return tuple(self._unconfirmed)
 
     def _leave(self, buses: Buses) -> None:

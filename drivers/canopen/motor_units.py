@@ -32,7 +32,7 @@ def coordinates(driver: CanopenDriver, transmission: Transmission) -> Coordinate
 
 
 def count_limits(found: Coordinates, lowest: Vector, highest: Vector) -> list[tuple[int, int] | None]:
-    """Return each motor's lowest and highest counts (607Dh) for joint limits; None where it has none.
+    """Return each motor's lowest and highest counts (607Dh) for joint limits, None without; DriverError beyond 32 bits.
 
     Raises:
         DriverError: counts that 32 bits do not hold.

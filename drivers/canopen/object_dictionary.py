@@ -51,7 +51,7 @@ class Entry:
 
     @property
     def key(self) -> int:
-        """Return index and sub-index in one number."""
+        """Return index and sub-index in one number, `index << 8 | sub`."""
         return self.index << 8 | self.sub
 
     def at(self, sub: int) -> Entry:

@@ -132,12 +132,12 @@ class Drive:
 
     @property
     def state(self) -> DriveState:
-        """Return the state of CiA 402, unknown before the first status word."""
+        """Return the state of CiA 402 by the last status word; UNKNOWN before one, and after a boot-up."""
         return DriveState.UNKNOWN if self.status is None else state_of(self.status)
 
     @property
     def axis_status(self) -> AxisStatus:
-        """Return the status in flags common to all fieldbuses; no flag before the first status word."""
+        """Return the status in flags common to all fieldbuses, by `let_go` where set, else by the last status word."""
         error = 0 if self.emergency is None else self.emergency.code
         status = self.status if self.let_go is None else self.let_go
         return AxisStatus(0) if status is None else axis_status(status, error)
@@ -306,7 +306,7 @@ class BusCodec:
         return [drive.node for drive in self.drives if drive.nmt is None or drive.heartbeat_ns < oldest]
 
     def stale(self) -> list[int]:
-        """Return the nodes whose status report has been missing for longer than its profile allows."""
+        """Return the nodes whose status report has been missing for longer than the profile's `status_timeout`."""
         return [drive.node for drive in self.drives if drive.status_age > self._status_cycles]
 
     def take_events(self) -> list[Event]:
@@ -317,7 +317,7 @@ class BusCodec:
         return taken
 
     def forget_events(self) -> None:
-        """Discard all events so far, so that conditions that persist are reported again."""
+        """Discard all events, but tell again at once what is not over: emergencies, and controllers in trouble."""
         self._events = []
         self._strangers.clear()
         self._foreign.clear()

@@ -132,7 +132,7 @@ class Pdo:
 
     @property
     def timing(self) -> Write:
-        """Return the download of the timer, which may be left at 0 where the drive has none."""
+        """Return the download of a TPDO's event timer or an RPDO's deadline [ms]; its value is 0 for none."""
         return Write(self._entry(4), self.timer)
 
     def _entry(self, which: int, sub: int | None = None) -> Entry:
@@ -206,7 +206,7 @@ class BusProfile:
 
     @property
     def status_timeout(self) -> float:
-        """Return how long to wait for a drive's status report [s]: one may be lost, and the next be delayed."""
+        """Return after how long a status report counts as missing [s]: 2.5 times its period or longer inhibit time."""
         return _STATUS_PATIENCE * max(self.status_period, self.status_inhibit)
 
     def pdos(self, node: int) -> list[Pdo]:
@@ -227,7 +227,7 @@ class BusProfile:
         return found
 
     def identifiers(self, node: int) -> list[Write]:
-        """Return the downloads of the COB-IDs of SYNC and emergencies; a drive that lacks an entry follows CiA 301."""
+        """Return the downloads of the COB-IDs of SYNC and emergencies, and of the emergencies' inhibit time."""
         return [
             Write(od.SYNC_COB_ID, SYNC, _NO_REMOTE),
             Write(od.EMERGENCY_COB_ID, EMERGENCY + node, _NO_REMOTE),
@@ -235,7 +235,7 @@ class BusProfile:
         ]
 
     def heartbeat(self, node: int) -> Write:
-        """Return the download of a drive's heartbeat period; a guarded drive cannot send one (CiA 301, 7.2.8.3.1)."""
+        """Return the download of a drive's heartbeat period, 0 for a guarded one, which can send none (CiA 301)."""
         return Write(od.HEARTBEAT_PRODUCER, 0 if node in self.guarded else _whole(self.heartbeat_drives, 1e-3))
 
     @property

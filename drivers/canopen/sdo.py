@@ -123,7 +123,7 @@ class Objects:
             self._others(frame)
 
     def read_bytes(self, index: int, sub: int, name: str) -> bytes:
-        """Return the value of an entry as bytes.
+        """Return the value of an entry as bytes; SdoRefused where the drive aborts, DriverError without an answer.
 
         Raises:
             SdoRefused: the drive aborts the upload.
@@ -132,7 +132,7 @@ class Objects:
         return bytes(self._request(f"reading {index:04X}h:{sub:02X} {name}", self._client.upload, index, sub))
 
     def read(self, entry: Entry) -> int:
-        """Return the value of an entry; raises as `read_bytes`, and DriverError for a value of another length."""
+        """Return the value of an entry; SdoRefused where the drive aborts, DriverError without a proper answer."""
         data = self.read_bytes(entry.index, entry.sub, entry.name)
         try:
             return entry.unpack(data)
@@ -140,7 +140,7 @@ class Objects:
             raise DriverError(f"node {self.node}: {error}") from None
 
     def write(self, write: Write) -> None:
-        """Set an entry without reading it back; raises as `read_bytes`."""
+        """Set an entry without reading it back; SdoRefused where the drive aborts, DriverError without an answer."""
         entry = write.entry
         what = f"setting {entry} to {write.value}"
         self._request(what, self._client.download, entry.index, entry.sub, write.data)
@@ -155,7 +155,7 @@ class Objects:
             return False
 
     def ensure(self, write: Write) -> None:
-        """Write an entry where it differs from a value, and read it back; raises as `set`, also without the entry."""
+        """Write an entry unless it holds the value, and read it back; SdoRefused or WriteNotVerified if that fails."""
         if not optional(self.holds, write):  # setting a missing entry raises the error
             self.set(write)
 
@@ -165,7 +165,7 @@ class Objects:
             self.set(write)
 
     def set(self, write: Write) -> None:
-        """Set an entry and read it back; raises as `read`, and WriteNotVerified when it holds something else."""
+        """Set an entry and read it back; WriteNotVerified if it holds something else, SdoRefused if aborted."""
         self.write(write)
         held = self.read(write.entry)
         if not write.same(held):

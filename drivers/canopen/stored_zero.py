@@ -73,7 +73,7 @@ class Zeros:
         return counts if mark == self.mark(number, counts) and mark else None
 
     def keep(self, objects: Objects, number: int, counts: int) -> None:
-        """Store these counts at home in a drive, and read them back; raises as `Objects.set`."""
+        """Store these counts at home and their mark in a drive, and read them back; raises as `Objects.set`."""
         objects.set(Write(od.ZERO_COUNTS, counts & 0xFFFF_FFFF))
         objects.set(Write(od.ZERO_MARK, self.mark(number, counts)))
 
@@ -152,6 +152,6 @@ class Zeros:
 
 
 def zeros_of(config: ArmConfig) -> Zeros | None:
-    """Return the zeros of an arm whose encoders need them (`zero: at_home`), else None; raises as `Zeros`."""
+    """Return the zeros of an arm whose encoders need them (`zero: at_home`), else None; DriverError without homes."""
     needed = isinstance(config.driver, CanopenDriver) and config.driver.zero == "at_home"
     return Zeros(config) if needed else None

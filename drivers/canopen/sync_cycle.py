@@ -373,7 +373,7 @@ class Buses:
             self.ask(silent[self._asked % len(silent)], od.STATUS_WORD)
 
     def keep_alive(self) -> None:
-        """Send the host's heartbeat where half of its period is over, and poll the guarded drives."""
+        """Send the host's heartbeat when due, and poll a guarded drive that is due, but not what is withheld."""
         now_ns = self.clock.now_ns()
         self._send_node_guarding(now_ns)
         if now_ns >= self._heartbeat_ns and "heartbeat" not in self.withheld:
@@ -477,7 +477,7 @@ class EnableSequence:
         return self._target == len(_WAY)
 
     def commands(self, now_ns: int) -> list[tuple[int, int]]:
-        """Return (drive number, control word) pairs to send in this cycle; raises on a fault or when time is over.
+        """Return (drive number, control word) pairs to send in this cycle; DriverError on a fault or a step too slow.
 
         Raises:
             DriveFaulted: a drive has a fault; which, and why as far as it is known.
@@ -574,7 +574,7 @@ class Resetting:
 
 
 def hold(drives: Sequence[Drive]) -> bool:
-    """Return whether some of the drives have reported that they are in quick stop."""
+    """Return whether at least one of the drives is in quick stop by its last status word."""
     return any(drive.state is DriveState.QUICK_STOP for drive in drives)
 
 

@@ -46,7 +46,7 @@ class StopSecuring(Enum):
 
 
 def joints_with_weight(model: ArmModel, limits: MotionLimits) -> tuple[str, ...]:
-    """Return the joints whose gravity torque exceeds 0.1 % of their torque limit in a sampled posture, braked or not.
+    """Return the names of joints whose gravity torque exceeds 0.1 % of their torque limit in any of 64 random postures.
 
     Args:
         model: model with prior parameters.
@@ -65,7 +65,7 @@ def joints_with_weight(model: ArmModel, limits: MotionLimits) -> tuple[str, ...]
 
 
 def after_stop(model: ArmModel, limits: MotionLimits) -> StopSecuring:
-    """Return how the arm is secured after a stop: as configured, else by its brakes; raises where joints would fall.
+    """Return how a stopped arm is secured: `hold` or `lower` if set, else brakes; MotionRefused if joints would fall.
 
     Args:
         model: model with prior parameters.
@@ -107,7 +107,7 @@ class Anchor:
         self._place = position.copy()
 
     def back(self, position: Vector) -> Vector:
-        """Return anchor minus position [rad or m], (joints,), clipped to the give; beyond, a joint drags its anchor."""
+        """Return anchor minus position [rad or m], at most 0.01 s of the velocity limit; beyond, the anchor follows."""
         pull = np.clip(self._place - position, -self._give, self._give)
         self._place = position + pull
         return pull

@@ -85,7 +85,7 @@ Step = tuple[str, Callable[[Arm], None]]
 
 
 def try_driver(config: ArmConfig, confirm: Callable[[str], str], arm: Arm | None = None) -> tuple[Promise, ...]:
-    """Open an arm, test each promise of the driver contract on it, with no torque but zero, and return the outcomes.
+    """Try the driver contract's promises on an arm, energised only if `confirm` returns its name; return the outcomes.
 
     Args:
         config: of the arm.

@@ -69,7 +69,7 @@ class ClearanceChecker:
         self._limits = limits
 
     def require_clear(self, reference: Reference, limits: MotionLimits) -> Generator[None, None, None]:
-        """Check that a trajectory and stops out of it keep clear, a few postures a yield; raises MotionRefused if not.
+        """Check in slices that a trajectory keeps clear and no stop out of it touches; MotionRefused if not.
 
         Where the arm stands nearer to something than the clearance, as after a stop, half of that distance is kept.
 
@@ -115,7 +115,7 @@ class ClearanceChecker:
 def trajectory_stop_contact(
     collision: CollisionModel, reference: Reference, limits: MotionLimits
 ) -> Generator[None, None, str | None]:
-    """Describe the first stop out of a trajectory in which bodies touch, by exact shapes, else None; in slices."""
+    """Describe in slices the first sampled stop out of a trajectory that touches, by exact shapes; None if none."""
     for time in np.arange(0.0, reference.duration, _BEGINS).tolist():
         stopping = stop(reference.at(time), limits)
         yield
@@ -146,7 +146,7 @@ def trajectory_clearance(
 
 
 def motion_stop_clearance(path: Path, limits: MotionLimits, model: ArmModel) -> Nearest:
-    """Return the smallest distance in sampled stops out of a motion, with pair and time, by capsules around bodies."""
+    """Return the smallest capsule distance in sampled stops out of a motion, its pair, and when the stop begins [s]."""
     capsules = CapsuleModel(model)
     nearest = Nearest(float("inf"), None, 0.0)
     if not capsules.pairs:
@@ -164,7 +164,7 @@ def motion_stop_clearance(path: Path, limits: MotionLimits, model: ArmModel) -> 
 
 
 def motion_stop_contact(path: Path, limits: MotionLimits, model: ArmModel) -> str | None:
-    """Describe the stop out of a motion in which bodies touch or overlap most, by capsules; None where none touches."""
+    """Describe the sampled stop out of a motion in which capsules around bodies overlap most; None if none touch."""
     nearest = motion_stop_clearance(path, limits, model)
     if nearest.distance > 0.0:
         return None
@@ -172,7 +172,7 @@ def motion_stop_contact(path: Path, limits: MotionLimits, model: ArmModel) -> st
 
 
 def require_clear(model: ArmModel, path: Path, trajectories: Sequence[Reference], limits: MotionLimits) -> None:
-    """Raise MotionRefused where the motion or a trajectory comes within the clearance, or a stop out of it touches.
+    """Raise MotionRefused unless motion and trajectories provably keep clear and no sampled stop out of them touches.
 
     Args:
         model: model of the arm, with its geometry and surroundings; without any, nothing is checked.
@@ -196,7 +196,7 @@ def require_clear(model: ArmModel, path: Path, trajectories: Sequence[Reference]
 def require_clear_trajectories(
     model: ArmModel, trajectories: Sequence[tuple[str, Reference]], limits: MotionLimits
 ) -> None:
-    """Raise MotionRefused where a trajectory comes within the clearance of anything, or a stop out of it touches.
+    """Raise MotionRefused unless trajectories provably keep the clearance and no sampled stop out of them touches.
 
     Args:
         model: model of the arm, with its geometry and surroundings; without any, nothing is checked.
@@ -228,7 +228,7 @@ SAG = 0.25  # of the following error, that an arm may give way outwards when its
 
 
 def position_limit_violations(position: Vector, limits: MotionLimits, names: Sequence[str]) -> list[str]:
-    """Describe in words which joints stand outside their position limits; empty where none does.
+    """Return a phrase for each joint that is outside its position limits, as NaN is; empty where none is.
 
     Args:
         position: [rad or m], shape (joints,).
@@ -243,7 +243,7 @@ def position_limit_violations(position: Vector, limits: MotionLimits, names: Seq
 
 
 def recoverable_limits(limits: MotionLimits) -> MotionLimits:
-    """Return limits whose position range is wider by the following error: from there an arm may still be led back."""
+    """Return limits whose position range is wider by the following error on each side: an arm there may be led back."""
     more = limits.following_error
     return replace(limits, lower=limits.lower - more, upper=limits.upper + more)
 

@@ -91,13 +91,13 @@ class Controls(Protocol):
 
     @property
     def homing(self) -> Homing:
-        """Return the stage of leading the held arm home: `NONE` until a person asks for it, then `ASKED`."""
+        """Return the stage of leading the held arm home: `NONE`, `ASKED`, then what `tell_homing` has set."""
 
     def tell_homing(self, stage: Homing) -> None:
         """Set the stage of leading the arm home; while it is `GOING`, `lease_ok` checks the requester of that."""
 
     def lease_ok(self, now_ns: int) -> bool:
-        """Return whether the requester of the motion is alive, as by a lease, at `now_ns` of the loop's clock."""
+        """Return whether the requester of the motion counts as alive; if not, the loop stops the arm."""
 
 
 class StopCondition:
@@ -150,7 +150,7 @@ class ControlFile:
         now_ns: Callable[[], int] = time.monotonic_ns,
         requested_ns: int | None = None,
     ) -> Self:
-        """Lock the control file as the process that moves the arm, set its controls off and renew the lease.
+        """Lock the control file for this process, clear its controls, start the lease; DriverError if it is in use.
 
         Only a stop that was asked for after `requested_ns` is there from the beginning.
 
@@ -212,7 +212,7 @@ class ControlFile:
 
     @classmethod
     def stop_motions(cls, path: Path, now_ns: Callable[[], int] = time.monotonic_ns) -> int | None:
-        """Request a stop of the motion under way and of all not yet begun; return the moving process's id or None.
+        """Request a stop of the motion under way and of all requested before now; return the moving pid or None.
 
         Args:
             path: path of the file, which is made where it is missing.
@@ -275,7 +275,7 @@ class ControlFile:
 
     @property
     def waiting(self) -> bool:
-        """Return whether the arm is held until a person confirms that it is supported or home."""
+        """Return whether the arm is held for a person to confirm its support; stays True once that is confirmed."""
         return self._memory[_WAITING] != 0
 
     def announce_hold(self) -> None:
@@ -289,7 +289,7 @@ class ControlFile:
         return self._memory[_SUPPORTED] != 0
 
     def confirm_support(self) -> None:
-        """Confirm for a person who sees it that the held arm is supported or home, whereupon the loop lowers it.
+        """Confirm that the held arm is supported or home, so that the loop lowers it; UsageError if none is held.
 
         Raises:
             UsageError: the arm does not wait for it; confirmed beforehand, it would release an arm that still moves.
@@ -310,7 +310,9 @@ class ControlFile:
         self._memory[_HOMING] = stage
 
     def request_home(self) -> None:
-        """Request that the held arm be led home, and clear stop and pause; then call `renew_home` four times a second.
+        """Request that an arm waiting after a stop be led home, clear stop and pause; UsageError if none waits.
+
+        The requester then calls `renew_home` more often than every `LEASE_SECONDS`.
 
         Raises:
             UsageError: the arm is not held; one that moves is stopped before it is led elsewhere.
@@ -342,7 +344,7 @@ class ControlFile:
         return length == 0 or self._now_ns() - renewed <= length
 
     def close(self) -> None:
-        """Release the lock and the memory."""
+        """Release the memory, and the lock if this process took it; the controls in the file stay as they are."""
         self._words.release()
         self._view.release()
         self._memory.close()
@@ -457,7 +459,7 @@ class SupervisedCommands:
 
     @property
     def supported(self) -> bool:
-        """Return whether a person has confirmed that the waiting arm is supported or home."""
+        """Return whether a person has confirmed, since the present hold began, that the arm is supported or home."""
         return self._controls.supported
 
     def announce_hold(self) -> None:
@@ -466,11 +468,11 @@ class SupervisedCommands:
 
     @property
     def homing(self) -> Homing:
-        """Return the stage of leading a held arm home."""
+        """Return the stage of leading a held arm home, `NONE` where nobody has asked for that."""
         return self._controls.homing
 
     def tell_homing(self, stage: Homing) -> None:
-        """Set the stage of leading a held arm home; while it is `GOING`, `lease_ok` checks that lease."""
+        """Set the stage of leading a held arm home; while `GOING`, `lease_ok` checks that requester's lease only."""
         self._controls.tell_homing(stage)
 
     @property
@@ -479,7 +481,7 @@ class SupervisedCommands:
         return bool(self._poll.poll(0))
 
     def lease_ok(self, now_ns: int) -> bool:
-        """Return whether the requester's pipe is open and lease valid; while led home, whether that lease is valid.
+        """Return whether the requester's pipe is open and, in real time, its lease valid; led home, only that lease.
 
         The motion home of a held arm has another requester, whose lease counts instead.
         """
@@ -512,7 +514,7 @@ class InterruptibleArm(Arm):
         self._arm.enable()
 
     def reset(self) -> None:
-        """Reset the wrapped arm."""
+        """Clear the faults that the wrapped arm's drives have latched; DriverError while it is enabled."""
         self._arm.reset()
 
     def exchange(self, torque: Vector | None) -> Sample:
@@ -548,7 +550,7 @@ class InterruptibleArm(Arm):
         return self._arm.operator_action
 
     def unconfirmed(self) -> tuple[str, ...]:
-        """Return in words which of the wrapped arm's drives did not confirm at closing that they are off, and why."""
+        """Describe drives of the wrapped arm that did not confirm at closing that they are off, or had restarted."""
         return self._arm.unconfirmed()
 
     def drive_status(self) -> tuple[AxisStatus, ...]:

@@ -45,10 +45,10 @@ class Sink(Protocol):
         """Return the reason why recording has ended; empty while it goes on, or where the reason is unknown."""
 
     def put(self, cycle: Cycle) -> bool:
-        """Take one cycle to be recorded; return False where the sink cannot keep up."""
+        """Take one cycle to be recorded; return False where the sink lags behind or has failed."""
 
     def event(self, stamp_ns: int, level: int, message: str) -> bool:
-        """Take one log message of the run, with its severity, to be recorded; return False where the sink lags."""
+        """Take one log message with its severity to be recorded; return False where the sink lags or has failed."""
 
 
 KEPT_SAMPLES: Final = 100
@@ -113,7 +113,7 @@ class Loop:
         self._hold_speed = HOLD_SPEED * self.limits.velocity
 
     def run(self, target: Vector, first: Sample | None = None) -> None:
-        """Run control cycles until the state is DONE, or STOPPED and the hold over; raises ArmFault to end torque.
+        """Run cycles until DONE, or STOPPED and the hold or lowering over; ArmFault where torque must end now.
 
         Args:
             target: target of the first cycle, which holds the arm where it stands, shape (joints,): torque [N m or N],

@@ -76,7 +76,7 @@ LONGEST_GAP = 20  # periods without a cycle, in which the arm is not supervised 
 
 
 def longest_stall(described: float | None, period: float, watchdogs: Iterable[Watchdog]) -> float:
-    """Return the longest tolerated stall [s]: described or default, capped by half of each watchdog and a silent gap.
+    """Return the longest tolerated stall [s]: `described` or default, at most half of any watchdog and 19 periods.
 
     Args:
         described: `control.longest_stall` of the arm's description [s].
@@ -174,7 +174,7 @@ class Deadlines:
         return self._of.known
 
     def cycle(self, stamp_ns: int, woken_ns: int, doubt_ns: int = 0) -> Fault | None:
-        """Return the fault of a cycle that is late, after a silence or of a jumped stamp, else None; updates lateness.
+        """Judge a cycle's timing; return its fault if it is late, after a silence or its stamp jumped, else None.
 
         Args:
             stamp_ns: of its sample [ns].

@@ -184,7 +184,7 @@ def measuring_rate(rate: float) -> float:
 
 
 def judge_rates(woken: Woken, rate: float, described: float | None, watchdogs: tuple[Watchdog, ...] = ()) -> list[Held]:
-    """Judge the measured rate and parts of it, highest first: held if no stall is too long and few cycles are lost.
+    """Judge `rate`, the measured rate and parts of it, highest first: good if no stall is too long and few are late.
 
     Args:
         woken: lateness that was measured.

@@ -58,7 +58,7 @@ class EncoderCoordinates:
 
     @staticmethod
     def of(coupling: Vector | None, joints: int) -> EncoderCoordinates:
-        """Return the coordinates of an arm's joints and of those drives that move several joints, from their coupling.
+        """Create the coordinates of all joints and of the drives that move several joints, from the arm's coupling.
 
         Args:
             coupling: drive coordinates per joint coordinates, shape (joints, joints); each joint's own drive when None.
@@ -70,7 +70,7 @@ class EncoderCoordinates:
         return EncoderCoordinates(coupling[shared], np.linalg.inv(coupling).T[shared])
 
     def steps(self, position: Vector, before: Vector) -> Vector:
-        """Return the change of each joint and drive since the position `before` [rad or m], (joints + drives,)."""
+        """Return the change of each joint and multi-joint drive since `before` [rad or m], shape (joints + drives,)."""
         change = position - before
         if not len(self.motions):
             return np.asarray(change)
@@ -79,37 +79,37 @@ class EncoderCoordinates:
         return np.concatenate([change, np.where(np.abs(drives) > _SAME, drives, 0.0)])
 
     def valid(self, valid: Flags) -> Flags:
-        """Return which joints and drives are known: a drive is where all joints that it moves are valid."""
+        """Return which joints and multi-joint drives are known: a drive is where all joints that it moves are valid."""
         if not len(self.motions):
             return valid
         return np.append(valid, (valid | (self.motions == 0.0)).all(axis=1))
 
     def velocities(self, of_joints: Vector) -> Vector:
-        """Append the drives' velocities (or accelerations) to those of the joints, shape (joints + drives,)."""
+        """Append the velocities (or accelerations) of drives that move several joints to those of joints."""
         return np.append(of_joints, self.motions @ of_joints) if len(self.motions) else of_joints
 
     def forces(self, of_joints: Vector) -> Vector:
-        """Append the drives' torques to those of the joints [N m or N], shape (joints + drives,)."""
+        """Append the torques [N m or N] of drives that move several joints to those of the joints."""
         return np.append(of_joints, self.torques @ of_joints) if len(self.torques) else of_joints
 
     def largest_motions(self, of_joints: Vector) -> Vector:
-        """Append each drive's largest motion if every joint moves by at most its value, shape (joints + drives,)."""
+        """Append each multi-joint drive's largest motion if every joint moves by at most its value."""
         return np.append(of_joints, np.abs(self.motions) @ of_joints)
 
     def largest_forces(self, of_joints: Vector) -> Vector:
-        """Append each drive's torque if only its most demanding joint needs its value, shape (joints + drives,)."""
+        """Append each multi-joint drive's torque if only its most demanding joint needs its value."""
         drives = np.abs(self.torques) * of_joints
         return np.append(of_joints, drives.max(axis=1, initial=0.0))
 
     def inertias(self, mass_matrix: Vector) -> Vector:
-        """Return the inertia of each joint and drive while the others stand [kg m^2 or kg], (joints + drives,)."""
+        """Return the inertia of each joint and multi-joint drive while all others stand [kg m^2 or kg]."""
         own = np.diag(mass_matrix)
         if not len(self.torques):
             return own
         return np.append(own, np.einsum("dj,jk,dk->d", self.torques, mass_matrix, self.torques))
 
     def at_joints(self, flags: Flags) -> Flags:
-        """Return which joints are flagged, by themselves or through a drive that moves them, shape (joints,)."""
+        """Return which joints are flagged, themselves or by a flagged multi-joint drive, shape (joints,)."""
         joints = self.motions.shape[1]
         if not len(self.motions):
             return flags
@@ -163,7 +163,7 @@ class FrozenEncoderObserver:
         position: Vector,
         feedforward: Vector | float = 0.0,
     ) -> Flags:
-        """Update the estimated unseen motion; return which joints and drives exceed what an encoder can hide.
+        """Estimate unseen motion; return which joints and multi-joint drives exceed what their encoders can hide.
 
         Args:
             steps: change of each position since the cycle before [rad or m], 0 where it was not measured, shape
@@ -240,9 +240,9 @@ def frozen_encoder_observer(
 
 
 def encoder_coupling(config: ArmConfig) -> Vector | None:
-    """Return the motion of the encoders per motion of the joints, shape (joints, joints), where encoders are at drives.
+    """Return the encoders' motion per motion of the joints, shape (joints, joints); None without a coupling.
 
-    None where each joint has its own drive. Whether friction and inertia are the drives' (`drive_terms`) is another
+    Without one each joint has its own drive. Whether friction and inertia are the drives' (`drive_terms`) is another
     question: encoders at shared drives count the drives' motion in any case.
     """
     gears = config.transmission

@@ -12,7 +12,7 @@ ENDED: Final = "ended.json"
 
 
 def write_ending(folder: Path, document: dict[str, Any]) -> None:
-    """Write the JSON report of how a run ended, or `{"error": MESSAGE}`, into its folder; it replaces an earlier one.
+    """Write `document`, the report of how a run ended, as JSON into its folder; it replaces an earlier one.
 
     Raises:
         UsageError: the folder cannot be written.

@@ -61,7 +61,7 @@ class StoredFault:
 
     @classmethod
     def from_document(cls, document: Any) -> Self:
-        """Create the fault from a dict as `document` returns it; raises one of `_UNREADABLE` where it is none."""
+        """Create the fault from a dict as `document` returns it; raises KeyError or ValueError, say, for another."""
         return cls(str(document["code"]), str(document["cause"]), float(document["written"]))
 
 
@@ -93,11 +93,11 @@ class FaultStore:
         self._faults, self._mark, self._controls = folder / "faults.json", folder / "moving.json", folder / CONTROLS
 
     def latched(self) -> dict[str, str]:
-        """Return a dict from code to cause of all stored faults, the earliest first; UsageError on a damaged file."""
+        """Return a dict from code to cause of all stored faults, a killed motion's last; UsageError if damaged."""
         return {one.code: one.cause for one in self.remembered()}
 
     def remembered(self) -> tuple[StoredFault, ...]:
-        """Return all stored faults, and one for a motion whose process died, the earliest first.
+        """Return all stored faults, the earliest first, and last one for a motion whose process died.
 
         Raises:
             UsageError: a file is damaged.

@@ -59,7 +59,7 @@ class PositionFile:
         self._path.unlink(missing_ok=True)
 
     def keep(self, arm: Arm) -> None:
-        """Watch a closed arm briefly and store where it stands; delete the stored position if it moves or is silent.
+        """Replace the stored position by where a closed arm stands, or by none if it moves, fails or is simulated.
 
         Arms that are new whenever they are opened, simulated ones, have no such position.
         """
@@ -78,10 +78,10 @@ class PositionFile:
                 write_atomically(self._path, json.dumps(document, indent=1) + "\n")
 
     def require_no_lost_turns(self, arm: Arm) -> None:
-        """Read an open arm's position; MotionRefused where all motors turned by whole turns since it was closed.
+        """Read an open arm's position; MotionRefused where its motors turned by whole turns only since it was closed.
 
         Raises:
-            MotionRefused: they do.
+            MotionRefused: they did.
             UsageError: as `read`.
             DriverError: the arm does not answer.
         """
@@ -115,7 +115,7 @@ def is_new_every_time(arm: Arm, config: ArmConfig) -> bool:
 
 
 def turned(last: LastPosition, position: Vector, config: ArmConfig) -> str:
-    """Describe the motors that turned by whole turns since an arm was closed; empty if none, or one by a fraction.
+    """Describe motors that made whole turns while an arm was closed; empty if none, one by a fraction, or no gears.
 
     Somebody may have moved the arm by hand. That all motors have turned by whole turns, and one by more than none, is
     what lost turns look like, and hardly what a hand does.

@@ -61,11 +61,11 @@ class TimedSink:
 
     @property
     def error(self) -> str:
-        """Return the reason why recording has ended; empty while it goes on."""
+        """Return the reason why recording has ended; empty while it goes on, or where the reason is unknown."""
         return self._sink.error
 
     def put(self, cycle: Cycle) -> bool:
-        """Count a cycle's lateness and computing time, and pass it to the sink; return False where that lags."""
+        """Count a cycle's lateness and computing time, and pass it to the sink; False where that lags or has failed."""
         self.lateness.add(cycle.lateness_ns)
         self.compute.add(cycle.compute_ns)
         return self._sink.put(cycle)
@@ -86,13 +86,13 @@ class TimedSink:
 
 
 def send_line(line: dict[str, Any]) -> None:
-    """Write one line of JSON to standard output; it is lost where the pipe is full or closed."""
+    """Write one line of JSON to standard output; it is lost where the pipe is closed, or full and non-blocking."""
     with suppress(OSError):
         os.write(sys.stdout.fileno(), json.dumps(line).encode() + b"\n")
 
 
 def main() -> int:
-    """Run the motion that standard input asks for and report to standard output; return 0 after DONE or STOPPED."""
+    """Run the motion that standard input asks for and report on standard output; return 0 without fault, 4 with one."""
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the terminal's Ctrl-C is for the parent, which asks for a stop
     line = sys.stdin.readline()

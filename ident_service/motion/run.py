@@ -58,7 +58,7 @@ _FIRST = -20  # of the nice values
 
 @contextmanager
 def keep_host_alive(arm: Arm) -> Iterator[None]:
-    """Exchange cycles without torque in a background thread during the block, which must not use the arm.
+    """During the block, exchange cycles without torque in a thread (none in lock step); the block must not use the arm.
 
     Args:
         arm: open, not enabled.

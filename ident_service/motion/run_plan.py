@@ -46,13 +46,13 @@ class Plan(Protocol):
         """Return whether the arm is held at the end and secured as after a stop, since nothing may support it there."""
 
     def require_possible(self, model: ArmModel, limits: MotionLimits) -> None:
-        """Raise MotionRefused where the plan is impossible from any start."""
+        """Raise MotionRefused where the plan cannot be followed, wherever the arm stands."""
 
     def admits(self, model: ArmModel, position: Vector, limits: MotionLimits) -> MotionLimits:
         """Return the limits of a run from this position [rad or m], (joints,); MotionRefused if it may not begin."""
 
     def legs(self, model: ArmModel, start: Vector, limits: MotionLimits) -> Sequence[Leg]:
-        """Return (state, reference) pairs from `start` [rad or m], (joints,), in order; MotionRefused if not clear."""
+        """Return (state, reference) pairs from `start`, in order; MotionRefused if one is impossible or not clear."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class ExcitationPlan:
         return limits
 
     def legs(self, model: ArmModel, start: Vector, limits: MotionLimits) -> Sequence[Leg]:
-        """Return approach, excitation and return as (state, slowed reference) pairs; MotionRefused if not clear."""
+        """Return approach, excitation, return as (state, slowed reference) pairs; MotionRefused if impossible."""
         exciting = PathReference(self.excitation.path)
         begin, end = exciting.at(0.0), exciting.at(exciting.duration)
         there, back = (
@@ -112,7 +112,7 @@ class PointToPointPlan:
         """Do nothing: home is inside the limits by the description's own check, as is the nearest posture inside."""
 
     def admits(self, model: ArmModel, position: Vector, limits: MotionLimits) -> MotionLimits:
-        """Return limits that include where the arm stands; MotionRefused too far outside, or with nothing to leave."""
+        """Return limits widened to where the arm stands; MotionRefused if too far outside, or nothing is to be left."""
         require_near(position, limits, model.chain.names)
         if self.destination is Destination.INSIDE and not position_limit_violations(
             position, limits, model.chain.names
@@ -121,7 +121,7 @@ class PointToPointPlan:
         return relaxed_limits(position, limits)
 
     def legs(self, model: ArmModel, start: Vector, limits: MotionLimits) -> Sequence[Leg]:
-        """Return one (state, slowed reference) pair to home or just inside the limits; MotionRefused if not clear."""
+        """Return one (state, slowed reference) pair to home or just inside the limits; MotionRefused if impossible."""
         end = limits.home if self.destination is Destination.HOME else just_inside(start, limits)
         way = plan_reduced_trajectory(rest(start), rest(end), relaxed_limits(start, limits))
         try:

@@ -129,7 +129,7 @@ class MonitoredSample:
 
 
 def checks(seen: MonitoredSample, limits: MotionLimits) -> Iterator[Check]:
-    """Yield all checks of a sample, each with the joints that it hits; those for untrustworthy data come first."""
+    """Yield all checks of a sample, each with a mask that may be empty; those for untrustworthy data come first."""
     yield from _what_cannot_be_believed(seen, limits)
     yield from _quick_stop_checks(seen)
     yield from _what_must_end(seen, limits)
@@ -419,7 +419,7 @@ class SafetyMonitor:
         return usable, fault
 
     def torque(self, wanted: Vector) -> tuple[Vector, Fault | None]:
-        """Check a torque; return it limited in size and, but for the first, in rate (0 if refused), and fault or None.
+        """Return the torque limited in size and rate (the first in size only; 0 if refused), and its fault or None.
 
         Args:
             wanted: torque demanded by the controller [N m or N], shape (joints,).
@@ -465,7 +465,7 @@ class SafetyMonitor:
         return leaves, fault
 
     def position(self, wanted: Vector) -> tuple[Vector, Fault | None]:
-        """Check a position for the drives; return it limited in step, or the last one if refused; and fault or None.
+        """Return the position limited in step for the drives (the last one if refused), and its fault or None.
 
         Args:
             wanted: position demanded by the trajectory [rad or m], shape (joints,).

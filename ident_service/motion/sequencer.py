@@ -61,7 +61,7 @@ class Paused:
         return self._stop.at(time)
 
     def resume(self, limits: MotionLimits | None = None) -> Resumed:
-        """Plan a trajectory from rest back onto the motion; return it with the rest of that; too slow for a cycle.
+        """Plan from rest back onto the motion; return this and what remains of it; may take tenths of a second.
 
         It joins the motion where it was left. Where no way leads there within the limits, it joins a little earlier and
         repeats that little; else a little later; else it begins the motion again. This takes a millisecond or few where
@@ -78,7 +78,7 @@ class Paused:
     def resume_in_slices(
         self, limits: MotionLimits | None = None, surroundings: ClearanceChecker | None = None
     ) -> Generator[None, None, Resumed]:
-        """Plan as `resume`, clear of surroundings, in slices for control cycles; the generator returns the same.
+        """Plan from rest back onto the motion in slices, clear of `surroundings`; the generator returns it.
 
         Args:
             limits: as for `resume`.
@@ -102,7 +102,7 @@ class Paused:
     def leave_in_slices(
         self, end: Setpoint, limits: MotionLimits, surroundings: ClearanceChecker | None = None
     ) -> Generator[None, None, RuckigReference]:
-        """Plan a straight, slowed trajectory to rest at `end` in slices; the generator returns it or raises.
+        """Plan in slices a straight trajectory to rest at `end` at half of `limits`; the generator returns it.
 
         Args:
             end: setpoint at rest.
@@ -261,7 +261,7 @@ class TrajectorySequencer:
             self._search = self._plan_out_of_pause(self._paused)
 
     def finish(self, stamp_ns: int) -> None:
-        """End the run early by a pause and a straight return; do nothing a second time, or on the last reference."""
+        """Pause to end the run early by a straight return, if free; nothing a second time or on the last reference."""
         if self._finishing or not self._later or self._states.state not in _UNDER_WAY:
             return
         self._finishing = True
@@ -279,7 +279,7 @@ class TrajectorySequencer:
         return (yield from paused.resume_in_slices(self._resuming, self._surroundings))
 
     def search_return(self) -> str | None:
-        """Do one slice of the search out of a pause; return why none exists, or None if found or still searching."""
+        """Do one slice of the search for a trajectory out of a pause or home; return why none exists, else None."""
         if self._search is None:
             return None
         try:

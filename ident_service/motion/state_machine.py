@@ -70,7 +70,7 @@ class StateMachine:
         self._observer = observer
 
     def enter(self, wanted: State) -> None:
-        """Enter another state and tell the observer; ArmError without such a transition or with a fault unacknowledged.
+        """Enter a state and tell the observer; ArmError without such a transition, or where active faults forbid it.
 
         Raises:
             ArmError: no transition leads there, a mistake of the program; or an unacknowledged fault forbids it.

@@ -141,7 +141,7 @@ def stop_extent(path: Path, limits: MotionLimits) -> tuple[Vector, Vector]:
 
 
 def require_stops_within_limits(path: Path, limits: MotionLimits, names: tuple[str, ...]) -> None:
-    """Raise MotionRefused where a stop out of the motion would leave the position limits of a joint.
+    """Raise MotionRefused where a stop out of the motion, sampled every 5 ms, would leave a joint's position limits.
 
     Args:
         path: the motion.

@@ -121,7 +121,7 @@ def measure(
     least: float | None = None,
     most: float | None = None,
 ) -> Measure:
-    """Create a measure from plain numbers; a number that is not finite counts as not measured."""
+    """Create a measure from plain numbers; a value that is not finite counts as not measured, such a limit as none."""
 
     def plain(number: float | None) -> float | None:
         return None if number is None or not isfinite(number) else float(number)
@@ -247,7 +247,7 @@ class Ticket:
         return {check.verdict for check in self.checks if check.code == code}
 
     def valid_for(self, subject: Subject, now: datetime) -> list[str]:
-        """Return why this ticket does not allow a motion: checks, expiry, other arm, motion or software; or nothing.
+        """Return the reasons why this ticket does not allow a motion now, by checks, age and subject; empty if it does.
 
         Args:
             subject: subject of the motion that is to begin, with the open arm's own description. One without a motion,

@@ -116,7 +116,7 @@ class RuckigReference:
         return run_to_end(self.extent_in_slices())
 
     def extent_in_slices(self) -> Generator[None, None, tuple[Vector, Vector]]:
-        """Compute `extent` in slices for control cycles; the generator returns lowest and highest position."""
+        """Compute the sampled lowest and highest position in slices for control cycles; the generator returns both."""
         # The position_extrema of ruckig itself miss turning points (pantor/ruckig#215), here by more than 0.1 rad.
         times = np.linspace(0.0, self.duration, 2 + int(self.duration / _EXTENT_STEP)).tolist()
         at_time = self._trajectory.at_time
@@ -146,7 +146,7 @@ def plan_reduced_trajectory(start: Setpoint, end: Setpoint, limits: MotionLimits
 def plan_reduced_trajectory_in_slices(
     start: Setpoint, end: Setpoint, limits: MotionLimits
 ) -> Generator[None, None, RuckigReference]:
-    """Plan as `plan_reduced_trajectory` in slices for control cycles; the generator returns the trajectory.
+    """Plan in slices a trajectory at half the limits, or what its ends need; the generator returns it.
 
     Raises:
         MotionRefused: as `plan_trajectory`, from any of its steps.
@@ -173,7 +173,7 @@ def plan_trajectory(start: Setpoint, end: Setpoint, limits: MotionLimits) -> Ruc
 def plan_trajectory_in_slices(
     start: Setpoint, end: Setpoint, limits: MotionLimits
 ) -> Generator[None, None, RuckigReference]:
-    """Plan as `plan_trajectory` in slices for control cycles; the generator returns the trajectory.
+    """Plan in slices a trajectory between two states of motion within the limits; the generator returns it.
 
     Raises:
         MotionRefused: as `plan_trajectory`, from any of its steps.

@@ -50,7 +50,7 @@ class LocalPort:
         self.send_all((frame,))
 
     def send_all(self, frames: Sequence[Frame]) -> None:
-        """Queue several frames at once, which costs hardly more than one; raises as `send` does."""
+        """Queue several frames at once; BusError at the first that is not taken, those before it stay queued."""
         now = time.monotonic_ns()
         for frame in frames:
             check_sendable(frame, fd=self._wire.fd)
@@ -62,7 +62,7 @@ class LocalPort:
         self._wire.turn(now)
 
     def offer(self, frames: Sequence[Frame]) -> int:
-        """Queue frames as `send_all` does, but without raising; returns how many were taken, from the first on."""
+        """Queue frames without raising, until one is not taken or the port is off; return how many were taken."""
         now, taken = time.monotonic_ns(), 0
         for frame in frames:
             if self.port.counters.state == "off" or not self._wire.medium.offer(self.port, self._as_sent(frame), now):

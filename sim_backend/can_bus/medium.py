@@ -70,7 +70,7 @@ class ErrorCounters:
         return self.set(self.sending - 1, self.receiving, stamp_ns) if self.sending else None
 
     def received(self, stamp_ns: int) -> Frame | None:
-        """Lower the receive errors for a frame received; return an error frame if the state changes, else None."""
+        """Lower the receive errors by 1, to 127 at most; return an error frame if the state changes, else None."""
         return self.set(self.sending, min(self.receiving - 1, _PASSIVE_SUCCESS), stamp_ns) if self.receiving else None
 
     def restart(self, stamp_ns: int) -> Frame:

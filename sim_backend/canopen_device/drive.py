@@ -59,13 +59,13 @@ class VendorWatchdogs:
         self._there = there
         self._node, self._emergency, self._late = node, emergency, late
 
-    def synced(self) -> None:
-        """Restart the watchdog of SYNC."""
+    def sync_arrived(self) -> None:
+        """Restart the watchdog of SYNC, if the drive has it set, and end its emergency, which sends `error reset`."""
         number = self._node.objects.number
         self._wait(_SYNC, NO_SYNC, number(_PERIODS) * number(_SYNC_PERIOD) * 1_000)
 
-    def targeted(self) -> None:
-        """Restart the watchdog of target torques."""
+    def target_arrived(self) -> None:
+        """Restart the watchdog of target torques, if the drive has it set, and end its emergency (`error reset`)."""
         self._wait(_TARGET, NO_TARGET, self._node.objects.number(_MILLISECONDS) * 1_000_000)
 
     def stop(self) -> None:
@@ -74,7 +74,7 @@ class VendorWatchdogs:
         self._node.stop(_TARGET)
 
     def due(self, name: str) -> None:
-        """Report a missing SYNC or target as an error if its timer is the one that ran out; ignore others."""
+        """Send the emergency of a missing SYNC or target and stop the drive, if such a timer ran out; ignore others."""
         if name in (_SYNC, _TARGET):
             self._emergency.occurs(NO_SYNC if name == _SYNC else NO_TARGET)
             self._late()
@@ -195,7 +195,7 @@ class TorqueLoop:
         self._acting = acts, now_ns
 
     def tell_mean(self, now_ns: int) -> None:
-        """Report the mean torque since the last report, where a position loop holds the motor."""
+        """Set 6077h and 6078h to the mean torque since the last call, while a position loop holds the motor."""
         if not self._motor.holds:
             return
         self._add(self._acting[0], now_ns)
@@ -320,7 +320,7 @@ class PowerStage:
         return False
 
     def reset_fault(self) -> None:
-        """Leave the state `fault` (transition 15): the cause is gone, and a host has reset it."""
+        """Enter `switch on disabled` (transition 15): the cause of a fault is gone, and a host has reset it."""
         self.state = PowerState.SWITCH_ON_DISABLED
 
     def disable_voltage(self) -> None:
@@ -329,7 +329,7 @@ class PowerStage:
             self._to(target)
 
     def quick_stop(self) -> None:
-        """Start a quick stop (transition 11), or its counterpart in another state; option code 605Ah."""
+        """Brake where operation is enabled (605Ah 0: switch off at once), else go where that command leads."""
         if self.state is PowerState.OPERATION_ENABLED:
             if self._node.objects.number(0x605A) == 0:
                 self._to(PowerState.SWITCH_ON_DISABLED)
@@ -497,19 +497,19 @@ class CanopenDrive:
 
     @property
     def released(self) -> bool:
-        """Return whether a host has switched the drive off and has left it pre-operational."""
+        """Return whether the drive is off and a host's NMT command has left it pre-operational."""
         off = self.power.state is PowerState.SWITCH_ON_DISABLED
         return off and self.nmt.commanded and self.nmt.state is State.PRE_OPERATIONAL
 
     def power_up(self, now_ns: int) -> None:
-        """Power the drive up; the boot-up message follows at once."""
+        """Power the drive up; the boot-up message follows with the next `tick`."""
         self._node.now_ns = now_ns
         self.motor.power_up(now_ns)
         self._like_new()
         self.nmt.boot(0)
 
     def receive(self, frame: Frame, now_ns: int) -> list[Frame]:
-        """Process a frame of another node; return the frames that the drive sends, in order.
+        """Process a frame of another node and return the frames that follow; of a SYNC, only the answers to it.
 
         Args:
             frame: frame of any kind; one that is not for this drive does nothing.
@@ -622,7 +622,7 @@ class CanopenDrive:
         return self._finish()
 
     def supply(self, on: bool, now_ns: int) -> list[Frame]:
-        """Switch the motor's power, not the firmware's, on or off; return the frames that the drive sends."""
+        """Switch the motor's power, not the firmware's, on or off; return the frames, an emergency with them."""
         self._node.now_ns = now_ns
         self.power.supply(on)
         if on:
@@ -648,7 +648,7 @@ class CanopenDrive:
             self.emergency.occurs(SYNC_LENGTH)  # without a counter (1019h is 0) it has none (CiA 301, 7.2.5)
             return
         if self.nmt.state is State.OPERATIONAL:
-            self._makers.synced()
+            self._makers.sync_arrived()
         self._sample(self._node.now_ns)
         self._torque.tell_mean(self._node.now_ns)
         self._pdos.sync()
@@ -663,7 +663,7 @@ class CanopenDrive:
     def _arrived(self, keys: tuple[int, ...]) -> None:
         """Handle objects that an RPDO or an SDO has set."""
         if self._personality.target in keys and self.nmt.state is State.OPERATIONAL:
-            self._makers.targeted()
+            self._makers.target_arrived()
         self._firmware.arrived(keys)
         if self.power.state is PowerState.OPERATION_ENABLED:
             self._torque.evaluate(self._node.now_ns)

@@ -131,7 +131,7 @@ class Nmt:
         self._node.stop(_LIFE)
 
     def answer_guarding(self) -> None:
-        """Answer a remote frame that asks for the state, and await the next one where life is guarded."""
+        """Answer a remote frame that asks for the state and await the next one; do nothing if heartbeats are sent."""
         objects = self._node.objects
         if objects.number(0x1017):
             return  # a node that sends heartbeats is not guarded

@@ -133,7 +133,7 @@ class Objects:
         self.entries.update(self._factory)
 
     def number(self, index: int, subindex: int = 0) -> int:
-        """Return a value that is a number; 0 where the EDS has no such object."""
+        """Return a value that is a number; 0 where the EDS has no such object, or one of another type."""
         value = self.values.get(index << 8 | subindex, 0)
         return value if isinstance(value, int) else 0
 
@@ -187,7 +187,7 @@ class Objects:
         self.written(key)
 
     def size(self, index: int, subindex: int) -> int:
-        """Return the size of an object [bytes], 0 for a string; raises SdoAbort when there is none."""
+        """Return the size of an integer of up to 32 bits [bytes], 0 for another type; SdoAbort when there is none."""
         return self._entry(index, subindex).size
 
     def _entry(self, index: int, subindex: int) -> Entry:

@@ -222,7 +222,7 @@ class Pdos:
             )
 
     def start(self) -> None:
-        """Start PDOs when the node is operational: each is sent once."""
+        """Start PDOs as the node becomes operational; those sent on a change are sent once by the next `changes`."""
         self._active = True
         for tpdo in self._tpdos:
             tpdo.last, tpdo.syncs = None, 0
@@ -289,7 +289,7 @@ class Pdos:
                     self._act(rpdo, data)
 
     def changes(self) -> None:
-        """Send the TPDOs that are sent on a change, where their values have changed."""
+        """Send the TPDOs that are sent on a change, where their values have changed and no inhibit time runs."""
         if not self._active:
             return
         for tpdo in self._tpdos:

@@ -172,7 +172,7 @@ class Body:
         self.advance(now_ns)
 
     def advance(self, now_ns: int) -> None:
-        """Advance the plant to this time; does nothing when it is there.
+        """Advance the plant to this time, if it is behind by more than `slack_ns`.
 
         Raises:
             DriverError: the plant ran away.
@@ -189,7 +189,7 @@ class Body:
                 self.watch(end)
 
     def support(self, now_ns: int) -> None:
-        """Hold the arm where it stands, at rest, until all motors are powered and given torque again."""
+        """Hold the arm where it stands, at rest, until all motors are powered and one of them is given torque again."""
         if not self.supported:
             self.advance(now_ns)
             self.plant.rest()
@@ -197,7 +197,7 @@ class Body:
             self.supported = True
 
     def lead(self, position: Vector, now_ns: int) -> None:
-        """Move the supported arm to another position, at rest.
+        """Move the supported arm to another position, at rest; DriverError where nobody supports it.
 
         Args:
             position: of the joints [rad or m], shape (joints,).

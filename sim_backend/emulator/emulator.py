@@ -71,12 +71,12 @@ class Emulator:
 
     @property
     def gone(self) -> bool:
-        """Return whether a fault has taken the bus."""
+        """Return whether a `bus_gone` fault acts, by which no frame gets through."""
         return any(fault.kind == "bus_gone" for fault in self._injection.active)
 
     @property
     def states(self) -> tuple[str, ...]:
-        """Describe the state of each drive, in words."""
+        """Describe the state of each drive, then of each companion, a safety puck say, in words."""
         drives = ("dead" if self._injection.dead(drive) else face.state for drive, face in enumerate(self.faces))
         return (*drives, *(companion.state for companion in self.companions))
 
@@ -97,7 +97,7 @@ class Emulator:
 
     @property
     def next_deadline_ns(self) -> int | None:
-        """Return when `tick` has something to do [ns]; None for never."""
+        """Return when `tick` has something to do [ns], a drive's timer or a fault; None for never."""
         if self._deadline is not None:
             return self._deadline[0]
         times = [begin for begin, _, _ in self._to_begin] + [end for end, _ in self._to_end]
@@ -129,7 +129,7 @@ class Emulator:
         sender: int | None = None,
         answer: Callable[[list[Sent]], object] | None = None,
     ) -> list[Sent]:
-        """Deliver a frame on a bus to all drives that listen to it; return the frames that they send, in order.
+        """Deliver a frame to a bus's devices; return the frames they send, but answers to a SYNC to `answer`, if given.
 
         Args:
             bus: index of the bus.
@@ -205,7 +205,7 @@ class Emulator:
         self._deadline = None
 
     def go_on(self, now_ns: int) -> None:
-        """Compute the arm's next step in advance; take it at once where its cycle is late, by `Body.overdue_ns`.
+        """Compute the arm's next step in advance, or advance the arm now where its cycle is overdue.
 
         Moving the arm takes longest; without this the answers to each cycle would come later, and late ones late.
         """
@@ -228,7 +228,7 @@ class Emulator:
         self._deadline = None
 
     def add_configured(self, faults: Iterable[DriveFault]) -> None:
-        """Schedule faults counted from the first SYNC, as those of the configuration."""
+        """Schedule faults that are counted from the next SYNC, besides those of the configuration."""
         self._configured += tuple(faults)
 
     def clear(self, now_ns: int) -> None:

@@ -261,7 +261,7 @@ class LockStepLink:
         return self.arm.drain(self._bus)
 
     def close(self) -> None:
-        """Close the link; any number of times."""
+        """Close the link; the emulated drives go on; any number of times."""
         if not self._closed:
             self._closed = True
             self.arm.leave(self._bus)

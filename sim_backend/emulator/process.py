@@ -81,7 +81,7 @@ class PythonCanBuses:
         return not self._heard.empty()
 
     def receive(self, timeout: float) -> tuple[int, Frame] | None:
-        """Return the next frame with the number of its bus; None when none comes in time.
+        """Return the number of a bus and the next frame on it; None when none comes in time.
 
         Args:
             timeout: how long to wait [s].
@@ -199,7 +199,7 @@ class HostedBuses:
         return bool(self._heard)
 
     def receive(self, timeout: float) -> tuple[int, Frame] | None:
-        """Return the next frame with the number of its bus; None when none comes in time.
+        """Return the number of a bus and the next frame on it; None when none comes in time.
 
         Args:
             timeout: how long to wait [s].
@@ -303,7 +303,7 @@ def emulate(
     stop_requested: Callable[[], bool] = lambda: False,
     commands: Callable[[], str | None] = lambda: None,
 ) -> Emulated:
-    """Run the drives of an arm on its configured interfaces until told to stop, and return a summary.
+    """Run the drives of an arm on its configured interfaces for `seconds` or until told to stop; return a summary.
 
     Args:
         config: of the arm.

@@ -115,7 +115,7 @@ class EmulatedPuck:
 
     @property
     def released(self) -> bool:
-        """Return whether a host has led the arm and has taken it to IDLE: then a person supports it."""
+        """Return whether the arm is IDLE and its host has asked for that since it was active, or it never was."""
         return self._safety.mode is SafetyMode.IDLE and self._safety.lowered_by_host
 
     @property
@@ -206,16 +206,16 @@ class EmulatedPuck:
         self._lasting = False
 
     def ignore_watchdogs(self, deaf: bool) -> None:
-        """Set whether the safety puck goes on although the host is gone."""
+        """Set whether the arm's safety puck goes on although the host is gone."""
         self._safety.ignores_heartbeat = deaf
 
     def warn(self, warned: bool, now_ns: int) -> list[Frame]:
-        """Set or clear the safety puck's warning of low supply voltage; return no frames."""
+        """Set or clear the arm's warning of low supply voltage at the safety puck; return no frames."""
         self._safety.low_supply(warned)
         return []
 
     def supply(self, on: bool, now_ns: int) -> list[Frame]:
-        """Release the emergency stop (on) or press it (off); return no frames."""
+        """Release (on) or press (off) the emergency stop of the whole arm; return no frames."""
         self._safety.emergency_stop(not on, now_ns)
         return []
 

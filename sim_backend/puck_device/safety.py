@@ -166,7 +166,7 @@ class EmulatedSafetyPuck:
         return self._taken()
 
     def press(self, key: str, now_ns: int) -> None:
-        """Press a pendant key: `idle`, which clears faults, or `activate`, which acts in IDLE without faults."""
+        """Press a pendant key: `idle` clears faults, `activate` acts in IDLE without any; no key in an e-stop."""
         self._now_ns = now_ns
         if self._pressed:
             return
