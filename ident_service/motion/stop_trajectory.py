@@ -157,7 +157,7 @@ def require_stops_within_limits(path: Path, limits: MotionLimits, names: tuple[s
     found = [
         f"{name}: {low:.3f}..{high:.3f} leaves {limits.lower[k]:g}..{limits.upper[k]:g}"
         for k, (name, low, high) in enumerate(zip(names, lowest, highest, strict=True))
-        if low < limits.lower[k] - slack[k] or high > limits.upper[k] + slack[k]
+        if not (low >= limits.lower[k] - slack[k] and high <= limits.upper[k] + slack[k])  # NaN too
     ]
     if found:
         raise MotionRefused("a stop out of the motion would leave the position limits: " + "; ".join(found))
