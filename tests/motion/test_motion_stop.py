@@ -284,8 +284,9 @@ def test_a_motion_whose_stops_leave_the_limits_is_refused_by_name() -> None:
     path = bench_excitation().path
     lowest, highest = stop_extent(path, LIMITS)
     require_stops_within_limits(path, replace(LIMITS, lower=lowest - 1e-6, upper=highest + 1e-6), ("shoulder", "elbow"))
-    with pytest.raises(MotionRefused, match="elbow"):  # what is no number is no limit that is kept
-        unknown = replace(LIMITS, lower=lowest - 1e-6, upper=np.array([highest[0] + 1e-6, np.nan]))
+    # What is no number is no limit that is kept.
+    unknown = replace(LIMITS, lower=lowest - 1e-6, upper=np.array([highest[0] + 1e-6, np.nan]))
+    with pytest.raises(MotionRefused, match="elbow"):
         require_stops_within_limits(path, unknown, ("shoulder", "elbow"))
     turning = path.at(np.linspace(0.0, path.duration, 5000))[0].max(axis=0)
     limits = replace(LIMITS, upper=np.array([LIMITS.upper[0], turning[1] - 0.01]))
