@@ -39,6 +39,7 @@ def _shipped_folder() -> Path:
 
 KeyPath = tuple[str | int, ...]
 MAX_DEPTH = 32
+_TOO_DEEP = f"nested deeper than {MAX_DEPTH} levels"
 MOST_BYTES = 256 * 2**10
 MOST_PROBLEMS, _LONGEST = 100, 500
 # YAML 1.1 reads 1e-4 as text; numbers people write are numbers here.
@@ -167,6 +168,9 @@ class _Builder:
         except yaml.MarkedYAMLError as error:
             mark = error.problem_mark or error.context_mark
             line, column = (mark.line + 1, mark.column + 1) if mark else (1, 1)
+            # Newer ones of libyaml have a limit of their own, and read ahead: the place is where that stopped.
+            if "maximum nesting depth" in (error.problem or ""):
+                raise ConfigError([Problem(self._path, line, column, _TOO_DEEP)]) from None
             remedy = "quote text with a colon in it, and look for a bracket, a quote or an indentation that is wrong"
             said = f"{error.problem or 'not YAML'}; {remedy}"
             raise ConfigError([Problem(self._path, line, column, said)]) from None
@@ -196,7 +200,7 @@ class _Builder:
         if not isinstance(event, yaml.CollectionStartEvent):  # an alias
             return None
         if depth > MAX_DEPTH:
-            self._refused.append(self._problem(event, f"nested deeper than {MAX_DEPTH} levels"))
+            self._refused.append(self._problem(event, _TOO_DEEP))
             raise ConfigError(first_problems(self._refused))
         if isinstance(event, yaml.SequenceStartEvent):
             return tuple(self._items(where, events, depth))
