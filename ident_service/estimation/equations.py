@@ -146,7 +146,7 @@ def equations(
     *,
     judging: bool = False,
 ) -> Equations:
-    """Read recordings once; return regressor equations in base parameters, compressed to triangles, in blocks of time.
+    """Read recordings into compressed equations in blocks of time; raises if a joint never moves, unless `judging`.
 
     Args:
         recordings: to read, one or several.

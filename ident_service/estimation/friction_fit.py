@@ -479,7 +479,7 @@ def searched(key: str) -> float:
 def fit_friction(
     trials: FrictionTrials | None, model: ArmModel, base: BaseParameters, conditions: FeasibleSet | None = None
 ) -> tuple[ArmModel, tuple[Choice, ...]]:
-    """Fit friction numbers left to `fit`; return the arm with them and, given `conditions`, each kind's choice.
+    """Fit friction numbers left to `fit`; return the arm with them and, given `conditions`, which were worth keeping.
 
     Args:
         trials: rows of the fitted recordings; None where nothing is to be fitted.
