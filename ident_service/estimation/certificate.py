@@ -117,7 +117,7 @@ def counts(block: ExactBlock) -> list[int]:
 def prove(
     statement: Statement, multipliers: Sequence[Array], y: Array
 ) -> tuple[list[list[Fraction]], list[Fraction]] | None:
-    """Round multipliers to fractions that prove infeasibility exactly, of blocks and rows; None if rounding breaks it.
+    """Return multipliers (blocks', rows') rounded to fractions that prove infeasibility; None if rounding breaks it.
 
     With them no body has the parameters: the multipliers' value is negative, or zero with one not zero.
 
@@ -336,7 +336,7 @@ def _spectrum(part: Part, entries: Array) -> Array:
 
 
 def congruence_maps(parts: Sequence[Part], z: Array) -> list[Array] | None:
-    """Return per part the matrix from entries of X to those of L X L^T, Z = L L^T; None if Z is not inside."""
+    """Return per part the matrix from entries of X to those of L X L^T, Z = L L^T; None if Z is outside the cone."""
     maps = []
     for part, piece in zip(parts, split(parts, z), strict=True):
         if not part.matrix:

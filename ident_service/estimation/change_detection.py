@@ -459,7 +459,7 @@ def meaning_of_effect(effect: Effect, found: ParameterChange, leading: Sequence[
 
 
 def friction_ratio(first: ComparedEstimate, second: ComparedEstimate, joint: int) -> tuple[float, float] | None:
-    """Return (friction of the second over the first, speed [rad/s or m/s] it is taken at); None where unknown.
+    """Return (viscous plus Coulomb friction, second over first, at the motion's RMS speed; that speed), or None.
 
     The speed is the root mean square of the motion's.
 

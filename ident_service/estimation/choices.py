@@ -56,7 +56,7 @@ def best_choice(option: str, held_out: Mapping[str, float]) -> Choice:
 
 
 def significant_choice(option: str, held_out: Mapping[str, Array]) -> Choice:
-    """Choose the first alternative, or of those that beat it clearly, on every third, the one of the smallest error.
+    """Choose the first alternative, unless others beat it on all thirds and by far; then the best of them.
 
     Args:
         option: key in the configuration's section `identification`.

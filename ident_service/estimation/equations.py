@@ -146,7 +146,7 @@ def equations(
     *,
     judging: bool = False,
 ) -> Equations:
-    """Read recordings once; return regressor equations in base parameters, compressed to triangles, in blocks of time.
+    """Read recordings into compressed equations in blocks of time; raises if a joint never moves, unless `judging`.
 
     Args:
         recordings: to read, one or several.
@@ -317,16 +317,18 @@ def _block_seconds(recording: Recording, model: ArmModel) -> float:
     return min(options.block, max(seconds, 0.0) / LEAST_BLOCKS) or options.block
 
 
-def equation_rows(recording: Recording, model: ArmModel, base: BaseParameters, *, once: bool = False) -> Iterator[Rows]:
+def equation_rows(
+    recording: Recording, model: ArmModel, base: BaseParameters, *, read_once: bool = False
+) -> Iterator[Rows]:
     """Yield regressor and torque rows in chunks; recorded torque times motor factors, less a known payload's.
 
-    The description states the motors' factors. Rows stay in the recording's memory unless they are asked for `once`.
+    The description states the motors' factors. Rows stay in the recording's memory unless `read_once` is True.
 
     Raises:
         RecordingError: the recording does not fit the arm or cannot be smoothed.
     """
     mixes = _torque_factors(model)
-    for rows in _recorded_rows(recording, model, base, once):
+    for rows in _recorded_rows(recording, model, base, read_once):
         yield _of_links(rows, recording, model, base, mixes)
 
 
@@ -391,13 +393,13 @@ def _torque_factors(model: ArmModel) -> Array | None:
     return np.asarray(np.linalg.solve(to_motors, np.array(factors)[:, None] * to_motors))
 
 
-def _recorded_rows(recording: Recording, model: ArmModel, base: BaseParameters, once: bool) -> Iterator[Rows]:
+def _recorded_rows(recording: Recording, model: ArmModel, base: BaseParameters, read_once: bool) -> Iterator[Rows]:
     if recording.joints != model.chain.joints:
         raise RecordingError(
             recording.path, f"has {recording.joints} joints but the arm {model.config.name} has {model.chain.joints}"
         )
     # Weights, uncertainty and report each take the rows of the final model again.
-    memory, kind, asked = None if once else memory_of(recording), f"rows of {len(base.base)} columns", model
+    memory, kind, asked = None if read_once else memory_of(recording), f"rows of {len(base.base)} columns", model
     if memory is not None and (kept := memory.recall(kind, (id(asked), id(base)))) is not None:
         yield from kept.rows
         return

@@ -112,7 +112,7 @@ def prepare(
     *,
     torque_constants: Literal["described", "unconstrained", "feasible"] = "described",
 ) -> Prepared:
-    """Fit delay, friction shape and torque constants to the recordings; return them with the then linear equations.
+    """Fit delay, friction shape and torque constants where these are asked for; return them and the linear equations.
 
     Args:
         recordings: recordings to fit to.
@@ -213,7 +213,7 @@ def _with_velocity(
 
 
 def gather(recordings: Sequence[Recording], model: ArmModel, base: BaseParameters) -> Equations:
-    """Read recordings and return their regressor equations in base parameters, in blocks of time."""
+    """Read recordings into equations in base parameters, in blocks of time; raises if a joint never moves."""
     return equations(recordings, model, base)
 
 

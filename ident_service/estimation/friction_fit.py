@@ -364,7 +364,7 @@ def _thinned_rows(
     """Read a recording's rows; a joint's table has its columns with the torque as the last."""
     parts: list[_Part] = []
     every, count, seen = 1, 0, 0
-    for rows in equation_rows(recording, model, base, once=True):
+    for rows in equation_rows(recording, model, base, read_once=True):
         picked = np.arange((-seen) % every, len(rows.time), every)
         seen += len(rows.time)
         parts.append(_part(rows, picked, columns, model))
@@ -479,7 +479,7 @@ def searched(key: str) -> float:
 def fit_friction(
     trials: FrictionTrials | None, model: ArmModel, base: BaseParameters, conditions: FeasibleSet | None = None
 ) -> tuple[ArmModel, tuple[Choice, ...]]:
-    """Fit friction numbers left to `fit`; return the arm with them and, given `conditions`, each kind's choice.
+    """Fit friction numbers left to `fit`; return the arm with them and, given `conditions`, which were worth keeping.
 
     Args:
         trials: rows of the fitted recordings; None where nothing is to be fitted.

@@ -162,7 +162,7 @@ class Payload:
     excess: Array | None = None
 
     def far(self) -> tuple[int, ...]:
-        """Return indices of joints whose residual is over 1 % of torque and 4 times a known identification's."""
+        """Return indices of joints whose residual is over 1 % of torque and 4 times the identification's, if known."""
         if self.excess is None:
             return ()
         matters = self.fitted.joint_relative_percent > 100.0 * RELEVANT_TORQUE
@@ -171,7 +171,7 @@ class Payload:
 
 @one_blas_thread()
 def identify_payload(arm: KnownArm, recorded: Equations, *, refit_offsets: bool = False) -> Payload:
-    """Return the payload's ten parameters and uncertainty, from torques beyond those of the identified arm.
+    """Estimate the body added to or taken off an identified arm, or that there is none, from the torques' difference.
 
     Args:
         arm: the arm as it was identified, with another load or none.

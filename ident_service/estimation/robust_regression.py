@@ -179,9 +179,9 @@ class SpreadRows:
 
 
 def spread_rows(
-    recordings: Sequence[Recording], model: ArmModel, base: BaseParameters, times: Array, shares: Array
+    recordings: Sequence[Recording], model: ArmModel, base: BaseParameters, torque_scales: Array, shares: Array
 ) -> SpreadRows:
-    """Read recordings once; return their rows, torques times `times`, thinned to every 2nd, 4th ... sample if many.
+    """Return recordings' rows, thinned if many; torques times `torque_scales`, rows near standstill times `shares`.
 
     Raises:
         RecordingError: a recording cannot be used.
@@ -194,7 +194,7 @@ def spread_rows(
             picked = np.arange((-seen) % every, len(rows.time), every)
             seen += len(rows.time)
             count = np.where(rows.keep[picked], 1.0, shares)
-            torque = rows.torque[picked] * times
+            torque = rows.torque[picked] * torque_scales
             kept.append(
                 tuple(
                     np.column_stack([rows.H_b[joint][support[:, None], picked].T, torque[:, joint]])

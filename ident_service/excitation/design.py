@@ -195,7 +195,7 @@ class Prover:
         best: Attempt | None = None,
         task: Task | None = None,
     ) -> Attempt | None:
-        """Prove candidates, best first, searched on or shrunk where a proof fails; return the best attempt or None.
+        """Prove candidates, best first, searching on or shrinking if that fails; return the best, even if unproven.
 
         Args:
             candidates: candidates of the search. Their values are of a smoothed criterion; the exact one, used here,

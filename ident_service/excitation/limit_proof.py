@@ -488,7 +488,7 @@ def violations(proof: Proof, model: ArmModel, limits: MotionLimits) -> list[str]
 
 
 def tightened(task: Task, proof: Proof, limits: MotionLimits) -> Task | None:
-    """Return a task that keeps free what a proof found missing; None if nothing is, or over 0.2 m of clearance.
+    """Return the task made harder by what a proof found missing; None if nothing is, or extra clearance reaches 0.2 m.
 
     The search forecasts friction alone. The simulated arm also has heavier links, and takes its time to settle, and the
     tube around its motion is as wide as its worst joint makes it.

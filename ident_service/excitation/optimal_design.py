@@ -33,7 +33,7 @@ from ident_service.excitation.prediction import (
     FollowingError,
     dry_friction,
     rate_of_change,
-    unknown_friction,
+    uncompensated_friction,
 )
 from ident_service.excitation.trajectory import Basis, maps
 from ident_service.model.arm_model import ArmModel
@@ -228,7 +228,7 @@ class Problem:
         self._torque_parameters()
         self._following: FollowingError | None = None
         if task.friction is not None and model.prior is not None:
-            unknown = unknown_friction(task.friction, model.config.control.friction_feedforward)
+            unknown = uncompensated_friction(task.friction, model.config.control.friction_feedforward)
             self._following = FollowingError(model, limits, unknown, _TURNING * limits.velocity)
             self._allowed = USABLE * limits.following_error
             self._rate_of = rate_of_change(times)
@@ -327,7 +327,7 @@ class Problem:
         return tuple(zip(self._maps, middles, sizes, strict=True))
 
     def speed_from_error(self, x: Array) -> Array:
-        """Return the speed that catching up adds, as share of the allowed; negative if it slows; (samples, joints)."""
+        """Return speed added by correcting the following error, over the allowed; negative slows; (samples, joints)."""
         q, dq = (values @ self.coefficients(x).T for values in self._maps[:2])
         if self._following is None:
             return np.zeros_like(q)

@@ -196,8 +196,8 @@ def dry_friction(model: ArmModel, delta: Array) -> tuple[Array, Array]:
     return drives, drives @ np.abs(model.chain.coupling)
 
 
-def unknown_friction(friction: ExpectedFriction, share: float) -> ExpectedFriction:
-    """Return the largest friction that a feed-forward of `share` may leave uncompensated, offset zero."""
+def uncompensated_friction(friction: ExpectedFriction, share: float) -> ExpectedFriction:
+    """Return the most friction a feed-forward of `share` leaves if the true one is 0.6 to 1.4 times this; offset 0."""
     left = max(DOUBT[1] - share, share - DOUBT[0])
     return ExpectedFriction(left * friction.coulomb, left * friction.viscous, 0.0 * friction.offset)
 
@@ -211,7 +211,7 @@ class FollowingError:
         Args:
             model: model with prior parameters.
             limits: limits with the controller's gains.
-            friction: friction of the drives, as much of it as the control law does not know (`unknown_friction`).
+            friction: friction of the drives, as much of it as the control law does not know (`uncompensated_friction`).
             creep: velocity over which a joint's Coulomb friction turns round [rad/s or m/s], shape (joints,).
 
         Raises:
@@ -274,6 +274,6 @@ def predict_following_error(
         velocity: [rad/s or m/s], shape (samples, joints).
     """
     sharp = np.full(len(limits.kp), 1e-6)
-    unknown = unknown_friction(friction, model.config.control.friction_feedforward)
+    unknown = uncompensated_friction(friction, model.config.control.friction_feedforward)
     behind = FollowingError(model, limits, unknown, sharp).run(position, velocity)
     return np.asarray(np.abs(behind).max(axis=0))

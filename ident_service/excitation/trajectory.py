@@ -414,7 +414,7 @@ class PostureBasis:
         return self.standing(coefficients.mean(axis=1))
 
     def samples(self, per_period: int) -> tuple[Array, Array]:
-        """Return times [s] over the whole motion, with equal weights [s]."""
+        """Return `per_period` times [s] over the whole motion, with equal weights [s]."""
         duration = self.dwell * (len(self.times) + 1) + sum(self.times)
         step = duration / per_period
         return np.asarray(step * (np.arange(per_period) + 0.5)), np.full(per_period, step, dtype=float)

@@ -87,7 +87,7 @@ def available_solvers() -> tuple[str, ...]:
 
 
 def require_solver(solver: str) -> str:
-    """Return the name (upper case) that cvxpy knows a solver by; raises UsageError if it is not installed.
+    """Return the name (upper case) that cvxpy knows a solver by; raises UsageError if it is not an available one.
 
     Raises:
         UsageError: it is not installed, or solves no semidefinite problems.
@@ -111,7 +111,7 @@ def convex_least_squares(
     bound: float | None = None,
     inside: bool = True,
 ) -> ConvexEstimate:
-    """Find the feasible base parameters that explain the torques best, through cvxpy.
+    """Find through cvxpy the feasible base parameters of least torque error, plus prior distance and custom penalty.
 
     Args:
         fit: the unconstrained least squares.
