@@ -140,6 +140,7 @@ def feasible_with_factors(
         tight=active_constraints(conditions, solution.duals[1:]),
         iterations=solution.iterations,
         solver_seconds=solution.seconds,
+        bound=solution.bound,
     )
     return estimate, np.asarray(solution.x[factors])
 
