@@ -198,7 +198,7 @@ class Arm(ABC):
         return self
 
     def zero(self) -> tuple[str, ...]:
-        """Set the present position of the closed arm as its configured home; return in words what each drive reports.
+        """Make the closed arm take its present position as its home until power is lost; return each drive's report.
 
         For a person who has led the arm there, and only where encoders count from where they were when power came.
         Nothing is energised and nothing moves; until the encoders lose their power, `open` finds its positions by it.
@@ -319,7 +319,7 @@ class Arm(ABC):
         """
 
     def exchange_position(self, position: Vector) -> Sample:
-        """Wait for the next cycle, send positions to axes that close the position loop, and return the sample.
+        """Wait for the next cycle, send joint positions, and return the sample; DriverError for an arm given torques.
 
         Args:
             position: position of each joint one cycle from here [rad or m], shape (joints,).

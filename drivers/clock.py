@@ -24,7 +24,7 @@ class Clock(Protocol):
 
     @property
     def utc_offset_ns(self) -> int:
-        """Return the difference from `now_ns` to nanoseconds since 1970 in UTC."""
+        """Return what to add to `now_ns` to get nanoseconds since 1970 in UTC."""
 
     def now_ns(self) -> int:
         """Return the monotonic time [ns]."""
@@ -70,7 +70,7 @@ class VirtualClock:
 
 
 def utc_offset_of_recording_ns(clock: Clock) -> int:
-    """Return the offset from a clock's stamps to UTC [ns]; of virtual time to now, or to SOURCE_DATE_EPOCH.
+    """Return the offset from a clock's stamps to UTC [ns]; it puts virtual time at now, or at SOURCE_DATE_EPOCH.
 
     Virtual time begins at zero, which viewers and `ros2 bag` show as 1970. Its recordings are laid so that now is now,
     or the second that the environment variable SOURCE_DATE_EPOCH names, for recordings that repeat to the byte.

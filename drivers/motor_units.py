@@ -116,7 +116,7 @@ class Coordinates:
         return replace(self, zero=tuple(counts), offset=np.array(position, dtype=float))
 
     def torque_counts(self, torque: Vector) -> tuple[list[int], bool]:
-        """Convert joint torques to counts of each motor, scaled down by group to the limits; and whether any was.
+        """Return each motor's counts for joint torques, scaled down by group to the limits, and whether any group was.
 
         Args:
             torque: of the joints [N m or N], shape (n,).

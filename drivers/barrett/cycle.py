@@ -164,7 +164,7 @@ class PuckCodec:
         return self._missing == 0
 
     def torque_frames(self, counts: Sequence[int]) -> list[Frame]:
-        """Return the frames that carry a torque to every puck [counts], in the arm's order; DriverError if too big."""
+        """Return a frame per group of pucks with torques [counts], given in the arm's order; DriverError if too big."""
         frames = []
         for group, members in self._slots:
             slots = [0, 0, 0, 0]
@@ -220,7 +220,7 @@ class PuckCodec:
         return taken
 
     def forget_events(self) -> None:
-        """Discard all events; a controller in trouble is told again at once, stray frames when the next one comes."""
+        """Discard all events, but queue again that the CAN controller is in trouble; stray frames can be told again."""
         self._events = []
         self._told.clear()
         if self.controller in LEFT_NORMAL:

@@ -218,7 +218,7 @@ class BarrettArm(Arm):
         self._unconfirmed: tuple[str, ...] = ()
 
     def look(self) -> Arm:
-        """Return a closed arm on the same bus that only asks pucks for positions and states, and sets nothing.
+        """Return a closed arm that only asks the pucks for positions and states; its cycles refuse an active arm.
 
         What it asks for is seen by the safety puck as well; so it asks no active arm, whose host may be the one that is
         to be missed.
@@ -326,7 +326,7 @@ class BarrettArm(Arm):
         self._require_open().silent = True
 
     def drive_status(self) -> tuple[AxisStatus, ...]:
-        """Return the last reported status of each puck in flags common to all fieldbuses."""
+        """Return the last reported status of each puck of the open arm, in flags common to all fieldbuses."""
         codec = self._require_open().codec
         return tuple(axis_status(puck, codec.safety) for puck in codec.pucks)
 
@@ -399,7 +399,7 @@ class BarrettArm(Arm):
         return sample
 
     def stop(self, kind: StopKind) -> None:
-        """Take all pucks to IDLE, whatever the kind; never raises. A stop that no frame could carry is sent again."""
+        """Take all pucks to IDLE, whatever the kind, trying again where no frame could be sent; never raises."""
         self._enabled = False
         self._no_torque()
         if self._bus is None or self._found is None or self._looks:
@@ -655,7 +655,7 @@ def _joined(words: list[AxisStatus]) -> AxisStatus:
 
 
 def from_config(config: ArmConfig, clock: Clock | None = None) -> BarrettArm:
-    """Create the arm of a configuration with pucks, not open.
+    """Create the closed arm of a configuration with pucks; `clock` is ignored. DriverError for an incomplete one.
 
     Args:
         config: the arm's.

@@ -309,7 +309,7 @@ def _listed(numbers: Sequence[int]) -> str:
 
 
 def limit(port: PropertyPort, arm: FoundArm, driver: BarrettDriver) -> None:
-    """Write velocity and torque limits and lower warnings to the safety puck, which forgets them without power.
+    """Write velocity and torque limits, and warnings below them, to the safety puck, which keeps them until power off.
 
     Raises:
         DriverError: it does not answer, or holds other values then.

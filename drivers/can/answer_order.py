@@ -40,7 +40,7 @@ class AnswerOrder:
         self._latest_ns = 0
 
     def take(self, delay_ns: int | None) -> int | None:
-        """Count an answer; return how many requests ago the one it may answer was, 0 if surely the latest, or None.
+        """Count an answer; return how many requests old it may be, 0 if surely the latest's, None if none was open.
 
         Args:
             delay_ns: time since the latest request [ns]; None where it is unknown.
@@ -72,7 +72,7 @@ class AnswerOrder:
         self.behind = max(0, self.behind - 1)
 
     def settle(self) -> bool:
-        """Return, as a cycle ends, whether an uncertain answer is the latest request's: the first two in a row are."""
+        """Return at a cycle's end whether an uncertain answer counts as the latest request's: the first two do."""
         self.uncertain = False
         self._doubted += 1
         return self._doubted <= _BELIEVED

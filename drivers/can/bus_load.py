@@ -57,14 +57,14 @@ def padded(length: int) -> int:
 
 
 def unstuffed(length: int, *, fd: bool = False) -> Bits:
-    """Return the bits of a data frame of so many bytes without stuffing; ValueError for a length no frame has."""
+    """Return the bits of an 11-bit identifier's data frame without stuffing; ValueError for a length no frame has."""
     if not fd:
         return Bits(_classical(length) + _TAIL)
     return Bits(_FD_ARBITRATION + _TAIL, _FD_CONTROL + 8 * padded(length) + _fd_checksum(padded(length)))
 
 
 def worst(length: int, *, fd: bool = False) -> Bits:
-    """Return the most bits that a data frame of so many bytes can have; ValueError for a length no frame has."""
+    """Return the most bits of an 11-bit identifier's data frame with so many bytes; ValueError for a wrong length."""
     plain = unstuffed(length, fd=fd)
     if not fd:
         return Bits(plain.nominal + (_classical(length) - 1) // 4)

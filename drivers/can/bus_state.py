@@ -76,7 +76,7 @@ class BusError(DriverError):
 
 
 def kind_of(code: int | None, otherwise: Kind = "refused") -> Kind:
-    """Return the kind of bus error that an errno means; `otherwise` for one that means none.
+    """Return the kind of bus error that an errno means; `otherwise` for None and for any other errno.
 
     Args:
         code: the errno, None where there is none.

@@ -114,7 +114,7 @@ def from_kernel(data: bytes, stamp_ns: int = 0) -> Frame:
 
 
 def pack_frames(frames: Iterable[tuple[Frame, bool]]) -> bytes:
-    """Pack frames into one packet for another process, little-endian.
+    """Pack frames, each with whether the packet's recipient sent it, into one little-endian packet for another process.
 
     A frame is a header of 16 bytes (stamp [ns], the kernel's identifier word, length, flags) and its data.
 

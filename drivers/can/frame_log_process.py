@@ -84,7 +84,7 @@ class OrderedLog:
         self.written = 0
 
     def add(self, bus: int, frames: list[tuple[Frame, bool]]) -> None:
-        """Add frames of one bus, and write those that no earlier frame can precede any more."""
+        """Add frames of one bus, and write, in the order of their stamps, all that are older than a fixed time."""
         for frame, sent in frames:
             heapq.heappush(self._heap, (frame.stamp_ns, next(self._numbers), frame, bus, sent))
         newest = max(frame.stamp_ns for frame, _ in frames)

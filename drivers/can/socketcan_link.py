@@ -168,7 +168,7 @@ def from_config(config: ArmConfig, bus_number: int) -> RawLink:
 
 
 def open_socket(channel: str, bitrate: int = 1_000_000, *, fd: bool = False) -> socket.socket:
-    """Open a CAN socket that receives all of CANopen and errors of the controller, but not its own frames.
+    """Open a CAN socket for 11-bit frames of others and controller errors; `bitrate` is for messages only, not set.
 
     Args:
         channel: network interface, as `ip link` names it.

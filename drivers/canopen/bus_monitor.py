@@ -216,7 +216,7 @@ class MonitoringArm(Arm):
         raise DriverError("a read-only arm cannot be reset")
 
     def exchange(self, torque: Vector | None) -> Sample:
-        """Ask every drive once by SDO for its position, status and errors, and return the sample; takes no torque.
+        """Wait for the next cycle, ask every drive for position, status and errors, and return the sample; no torque.
 
         Raises:
             DriverError: not open, a torque, a bus is gone, or another host has begun to stream: it must not be delayed.

@@ -499,7 +499,7 @@ class LeftDrive:
 
 
 def disable_supervision(objects: Objects, zeros: Zeros | None, number: int, restarted: Callable[[], bool]) -> LeftDrive:
-    """Disable a drive's supervision of its host if it is off; return its state, and whether it may still react.
+    """End a drive's supervision of its host unless it has power; return its state, and whether it may still react.
 
     A zero that the drive has confirmed it confirms afterwards too, and nothing else: one that restarted in the session
     has lost its zero. A part that it refuses does not keep it from the others.
@@ -537,21 +537,21 @@ def disable_supervision(objects: Objects, zeros: Zeros | None, number: int, rest
     return LeftDrive(state, reacts)
 
 
-def reset_farewell_fault(objects: Objects, blames: Callable[[], bool]) -> DriveState:
-    """Reset a fault that a drive has because its host left it; return the state in which it is at last.
+def reset_farewell_fault(objects: Objects, unrelated: Callable[[], bool]) -> DriveState:
+    """Reset a drive's fault, taken as due to its host having left unless `unrelated()`; return its last state.
 
     No next session could enable the drive, and closing the one that resets it would leave the fault behind again.
 
     Args:
         objects: of a drive that was off, without a fault, before it was left.
-        blames: whether the drive gives another reason for a fault, which then stays.
+        unrelated: whether the drive gives another reason for its fault, which then stays.
 
     Raises:
         DriverError: it does not answer, or refuses control words.
     """
     clock = objects.clock
     last_ns = clock.now_ns() + round(_RESET_PATIENCE * 1e9)
-    while (state := state_of(objects.read(od.STATUS_WORD))) in FAULTS and not blames() and clock.now_ns() < last_ns:
+    while (state := state_of(objects.read(od.STATUS_WORD))) in FAULTS and not unrelated() and clock.now_ns() < last_ns:
         for word in (DISABLE_VOLTAGE, RESET_FAULT):  # a rising edge; some drives look once in a millisecond
             objects.write(Write(od.CONTROL_WORD, word))
             clock.sleep_until_ns(clock.now_ns() + _RESET_STEP_NS)

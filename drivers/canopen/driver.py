@@ -70,7 +70,7 @@ from drivers.canopen.pdo_codec import BusCodec, Drive, Emergency
 from drivers.canopen.pdo_mapping import Write, bus_profiles
 from drivers.canopen.sdo import Objects, SdoRefused
 from drivers.canopen.stored_zero import zeros_of
-from drivers.canopen.sync_cycle import REPEAT, Buses, EnableSequence, Resetting, hold
+from drivers.canopen.sync_cycle import REPEAT, Buses, EnableSequence, Resetting, any_in_quick_stop
 from drivers.canopen.zeroing import ZeroingArm
 from drivers.clock import Clock, RealClock, VirtualClock
 from drivers.motor_units import Coordinates, unwrapped
@@ -124,7 +124,7 @@ class StopCommand:
                 self._untold.append(number)
 
     def counts(self, zero: Sequence[int]) -> Sequence[int] | None:
-        """Return `zero`, or None for no torque frames while a drive has not been told to stop.
+        """Return `zero`; None, for no torque frames, while a drive's link has not taken its stop.
 
         Drives that get zero torque, but not yet the stop, would let an arm fall that they or their brakes are to hold.
 
@@ -449,7 +449,7 @@ class CanopenArm(Arm):
                 since the arm was opened, or does not follow in time. Only drives that held the arm before still do.
         """
         buses = self._open()
-        held = hold(buses.drives)
+        held = any_in_quick_stop(buses.drives)
         self._no_torque()
         self._streaming, self._stop = True, StopCommand()
         try:
@@ -539,7 +539,7 @@ class CanopenArm(Arm):
         self._open().withheld.add(kind)
 
     def drive_status(self) -> tuple[AxisStatus, ...]:
-        """Return the last reported status of each drive in flags common to all fieldbuses."""
+        """Return the last reported status of each drive of the open arm, in flags common to all fieldbuses."""
         return tuple(drive.axis_status for drive in self._open().drives)
 
     def stop(self, kind: StopKind) -> None:
@@ -561,7 +561,7 @@ class CanopenArm(Arm):
         The same holds for drives that were found holding the arm in quick stop, unless they have been told to let go.
         """
         if not self._stop.braking:
-            held = not self._stops and self._buses is not None and hold(self._buses.drives)
+            held = not self._stops and self._buses is not None and any_in_quick_stop(self._buses.drives)
             self.stop(StopKind.QUICK_STOP if held else StopKind.TORQUE_OFF)
         if self._buses is not None:
             self._leave(self._buses)
@@ -615,12 +615,12 @@ class CanopenArm(Arm):
             buses.clock.sleep_until_ns(buses.clock.now_ns() + round(_NOTICED * 1e9))
         for number, known in before.items():
 
-            def blames(drive: Drive = buses.drives[number], known: Emergency | None = known) -> bool:
+            def unrelated(drive: Drive = buses.drives[number], known: Emergency | None = known) -> bool:
                 told = drive.emergency
                 return told is not None and told is not known and not is_communication_error(told.code)
 
             try:
-                state = reset_farewell_fault(buses.objects(number), blames)
+                state = reset_farewell_fault(buses.objects(number), unrelated)
                 said = "" if state in POWER_OFF - FAULTS else f"is in the state {state} since it was left"
             except Exception as error:  # noqa: BLE001 - as in `_leave`
                 said = str(error) or repr(error)
@@ -755,7 +755,7 @@ class CanopenArm(Arm):
 
 
 def from_config(config: ArmConfig, clock: Clock | None = None) -> CanopenArm:
-    """Create the arm of a configuration with a CANopen driver, not open.
+    """Create the closed arm of a CANopen configuration; `clock` is ignored. DriverError for an incomplete one.
 
     Args:
         config: the arm's.

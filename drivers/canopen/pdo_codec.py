@@ -137,7 +137,7 @@ class Drive:
 
     @property
     def axis_status(self) -> AxisStatus:
-        """Return the status in flags common to all fieldbuses, by `let_go` where set, else by the last status word."""
+        """Return status flags by the status word that told that the drive let go (`let_go`), else by the last one."""
         error = 0 if self.emergency is None else self.emergency.code
         status = self.status if self.let_go is None else self.let_go
         return AxisStatus(0) if status is None else axis_status(status, error)
@@ -317,7 +317,7 @@ class BusCodec:
         return taken
 
     def forget_events(self) -> None:
-        """Discard all events, but tell again at once what is not over: emergencies, and controllers in trouble."""
+        """Discard events and drives' `let_go`; tell again what is not over: emergencies, controllers in trouble."""
         self._events = []
         self._strangers.clear()
         self._foreign.clear()

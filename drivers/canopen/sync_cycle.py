@@ -143,7 +143,7 @@ class Buses:
         link.send(codec.control_word(self.drives[number].node, word, mode.sent))
 
     def control_stop(self, number: int, word: int, *, deaf: bool = False) -> None:
-        """Send a control word that stops; by SDO too where a drive may have left `operational`, deaf to RPDOs.
+        """Send a control word that stops a drive; by SDO too if it is `deaf`, or may have left `operational`.
 
         Args:
             number: of the drive.
@@ -573,7 +573,7 @@ class Resetting:
         return words
 
 
-def hold(drives: Sequence[Drive]) -> bool:
+def any_in_quick_stop(drives: Sequence[Drive]) -> bool:
     """Return whether at least one of the drives is in quick stop by its last status word."""
     return any(drive.state is DriveState.QUICK_STOP for drive in drives)
 

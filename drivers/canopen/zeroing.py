@@ -35,7 +35,7 @@ class ZeroingArm(MonitoringArm):
         """Do nothing before the counts are taken."""
 
     def set_home(self) -> tuple[str, ...]:
-        """Store in every drive its present counts as those at home; return each drive's state in words.
+        """Store in every drive, if all are off and at rest, its present counts as home; return drives' states in words.
 
         Raises:
             DriverError: not open, an arm without `zero: at_home`, a drive that does not answer, is powered, or cannot
