@@ -164,7 +164,7 @@ def split_name(name: str) -> tuple[str, int]:
 
 
 def parse_expression(text: str) -> Row:
-    """Parse a sum such as `m1 + 2*(lx2 - 0.5*m2)` into the exact coefficient of each name; nothing is evaluated.
+    """Parse a sum such as `m1 + 2*(lx2 - 0.5*m2)`, without constants, into the exact coefficient of each name.
 
     The grammar, of which any name is read here::
 
@@ -1224,7 +1224,7 @@ def read_file(path: Path) -> str:
 
 
 def require_folder(folder: Path) -> None:
-    """Raise if a file that is there differs from its manifest, if any, or the parameters are another arm's.
+    """Raise if a file differs from the folder's manifest, if any, or the parameters are of another arm than `arm.json`.
 
     Raises:
         OSError: a file cannot be read, or `parameters.json` is not there.
@@ -1301,7 +1301,7 @@ def answer_text(path: Path, answer: Verification) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Check the file or folder on the command line, print the verdict; return 0 `feasible`, 2 no readable file, 3 else.
+    """Check the file or folder on the command line, print the verdict; return 0 feasible, 2 no parameter file, 3 else.
 
     Returns:
         0: consistent with its own conditions, and these can be met. 3: not so. 2: the file cannot be read, or is

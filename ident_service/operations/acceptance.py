@@ -59,7 +59,7 @@ class Acceptance:
 
 
 def accept(db: Database, state: Path, folder: Path, note: str, who: str, *, arm: str | None = None) -> Acceptance:
-    """Verify a run's folder, make its parameters the arm's current accepted set, and close its drift alarms.
+    """Make a run's parameters, feasible and as its manifest says, the arm's current accepted set; end its drift alarms.
 
     Args:
         db: the registry.
@@ -155,7 +155,7 @@ def acceptances(state: Path, arm: str) -> list[Acceptance]:
 
 
 def accepted_set(state: Path, arm: str, number: int | None = None) -> tuple[Acceptance, Path]:
-    """Return (acceptance, folder with its files, which are verified); the current one if `number` is None.
+    """Return (acceptance, folder of its files), the current one if `number` is None; its parameters are verified.
 
     Raises:
         UsageError: nothing was accepted, or nothing of this number.

@@ -63,7 +63,7 @@ def write_ticket(path: Path, ticket: Ticket) -> None:
 
 
 def ticket_text(ticket: Ticket) -> str:
-    """Format the ticket as text: of each check the measure that is nearest to its limit."""
+    """Format the ticket as text: each check's verdict, nearest measure or reason, and whether the arm may move."""
     motion = ticket.subject.excitation
     lines = [f"preflight of {ticket.subject.arm} for {f'the {motion} motion' if motion else 'the path home'}", ""]
     for check in ticket.checks:

@@ -79,7 +79,7 @@ def true_parameters(config: ArmConfig, model: ArmModel) -> Array | None:
 
 
 def score(estimate: Estimate, truth: Array, plant_motion: Sequence[Truth], unseen: Equations) -> Score:
-    """Compare an estimate with the truth: deviations in sigma, noise-free torque error [%], ratio of residuals.
+    """Compare an estimate with the truth: deviations in sigma, noise-free torque error [%], residual over the truth's.
 
     Args:
         estimate: identified estimate.
@@ -154,7 +154,7 @@ def record_motion(
     path: Path,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> RunReport:
-    """Run one motion on an arm, record it into an MCAP file, and return the report, also after a stop.
+    """Open an arm, run one motion, record it into a new MCAP file, and return the report, also after a stop.
 
     Args:
         arm: the arm, not yet open.

@@ -31,7 +31,7 @@ _PLACES: Final = (RUNS, MOTIONS, DESCRIPTIONS, "arms")
 
 
 def delete_run(db: Database, state: Path, run: str, who: str, *, anyway: bool = False) -> list[Dependent]:
-    """Delete a run's folder and report, unless something refers to it or with `anyway`; return what referred to it.
+    """Delete a run, its folder and its report; raise InUse if anything refers to it, unless `anyway`; return that.
 
     Acceptances keep their copy of its parameters, and operating hours still count it.
 
@@ -58,7 +58,10 @@ def delete_run(db: Database, state: Path, run: str, who: str, *, anyway: bool = 
 
 
 def delete_motion(db: Database, state: Path, motion: str, who: str, *, anyway: bool = False) -> list[Dependent]:
-    """Delete a motion, and with `anyway` the schedules that would run it; return these. Arguments as `delete_run`."""
+    """Delete a motion and the schedules that would run it, raising InUse for them unless `anyway`; return them.
+
+    Arguments as `delete_run`.
+    """
     row = known_motion(db, motion)
     found = [Dependent("schedule", str(one), "deleted") for one in _schedules_of(db, row)]
     _require_idle(f"the motion {motion}", _jobs_about(db, row["arm"], motion))
@@ -68,7 +71,7 @@ def delete_motion(db: Database, state: Path, motion: str, who: str, *, anyway: b
 
 
 def delete_arm(db: Database, state: Path, arm: str, who: str, *, anyway: bool = False) -> list[Dependent]:
-    """Delete an uploaded arm, with `anyway` all its runs, motions, schedules, acceptances too; return these.
+    """Delete an uploaded arm, its runs, motions, schedules, acceptances; InUse for any unless `anyway`; return them.
 
     A shipped arm of the same name is there again afterwards.
 

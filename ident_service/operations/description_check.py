@@ -64,7 +64,7 @@ class CheckedDescription:
 
 
 def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescription:
-    """Load a description, build its model, judge bus budget, gains and stop behaviour; return what was found.
+    """Load a description, ConfigError for mistakes; judge bus budget, gains, stop behaviour; return what was found.
 
     Args:
         arm: file of the description, or name of a shipped one.

@@ -27,7 +27,7 @@ _NEW, _DRAW = "new", "draw"  # the words for the second thing, and the third
 
 
 def judge_apart(path: Path) -> dict[str, Any]:
-    """Judge an uploaded description in a separate process; return `good`, `stable`, `objections`, `text` and more.
+    """Judge an uploaded description in a separate process; return `good`, `objections` and more, or raise ConfigError.
 
     Returns:
         `arm`, `sha256`, `good`, `stable`, `objections` and `text`.

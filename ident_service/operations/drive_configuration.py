@@ -189,7 +189,7 @@ def import_configuration(
     dry: bool,
     open_bus: Callable[[ArmConfig], list[Link]] = open_links,
 ) -> tuple[ImportedDrive, ...]:
-    """Write the values of one DCF per drive into the drives, or with `dry` only list them; return the changes.
+    """Write the values of DCFs, one per drive in order, into the drives, or with `dry` only list them; return changes.
 
     A drive that refuses one of them, or keeps another value, is set back to what it held, and so are those before it;
     so are all after an interrupt or any other error. The error says so, itself or in a note.

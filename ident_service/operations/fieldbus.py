@@ -402,7 +402,7 @@ class Probe:
 
     @property
     def highest_rate(self) -> int:
-        """Return the highest rate with the torque frames that the drives allow [Hz]."""
+        """Return the highest rate that the buses carry [Hz]: torque frames shared if every drive can, else single."""
         return self.rates["shared" if self.shares else "single"]
 
 

@@ -132,7 +132,7 @@ def add_schedule(db: Database, arm: str, when: DueRule, by: str, now: float, mot
 
 
 def schedules(db: Database, arm: str | None = None) -> list[Row]:
-    """Return all schedules, or those of an arm, the earliest first; `motion` is an id or None."""
+    """Return all schedules, or those of an arm, the earliest first; each row's `motion` is an id or None."""
     rows = db.rows("SELECT * FROM schedules WHERE ? IS NULL OR arm = ? ORDER BY id", arm, arm)
     return [{**row, "motion": json.loads(row["request"]).get("motion")} for row in rows]
 
@@ -180,7 +180,7 @@ def remove_schedule(db: Database, number: int, by: str) -> None:
 
 
 def add_event(db: Database, arm: str, what: str, remark: str, by: str, now: float) -> Row:
-    """Enter maintenance that was done; mark the schedules that follow maintenance as due; return its row.
+    """Enter maintenance that was done, mark the schedules that follow maintenance as due, return the event's row.
 
     Args:
         db: the registry.

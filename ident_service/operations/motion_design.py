@@ -142,7 +142,7 @@ def design_files(
     tell: Callable[[Progress], None] = lambda _: None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> tuple[Designed, Preview]:
-    """Search for a motion; write the motion, the search and a preview into a folder; return motion and preview.
+    """Search for a motion until done or cancelled; write the best, the search and a preview; return (motion, preview).
 
     Args:
         request: description, data and options.
@@ -227,7 +227,7 @@ def write_preview(folder: Path, seen: Preview) -> None:
 
 
 def known_model(arm: str, knowledge: PriorData) -> ArmModel:
-    """Return the arm's model, with identified link parameters if the knowledge has some.
+    """Return the arm's model, its prior from the knowledge's parameter file if given; UsageError if of another arm.
 
     Raises:
         UsageError: the parameter file has no link parameters of this arm.

@@ -28,7 +28,7 @@ Asked = Literal["pause", "resume", "finish", "supported"]
 
 
 def ask_process(path: Path, asked: Asked) -> int:
-    """Write a request into a control file, for the process that holds it; return its id; does not wait for it.
+    """Write a request into a control file for the process that holds it, do not wait; return that process's id.
 
     Args:
         path: of the control file.
@@ -50,7 +50,7 @@ def ask_process(path: Path, asked: Asked) -> int:
 
 
 def ask_arm(state: Path, arm: str, asked: Asked) -> bool:
-    """Send `pause`, `resume` or such to the process that moves or holds an arm; return whether there was one."""
+    """Send a request, such as `pause`, to the process that moves or holds an arm; return whether there was one."""
     return bool(_reach(state, arm, lambda path: ask_process(path, asked)))
 
 

@@ -258,7 +258,7 @@ def new_description(
     tell: Callable[[str], None] = lambda _: None,
     convention: str | None = None,
 ) -> tuple[Path, tuple[str, ...]]:
-    """Write an arm's description, a copy of its URDF or MJCF, and the schema; return (path, what was guessed).
+    """Write an arm's description begun from a URDF, MJCF or DH table, a copy and the schema; return (path, guesses).
 
     Args:
         source: a URDF, an MJCF, or a DH table as CSV or YAML.

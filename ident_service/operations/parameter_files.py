@@ -83,7 +83,7 @@ class CorrectedFile:
 def check_file(
     path: Path, kind: FeasibleSetName | None = None, arm: str | None = None, notation: Notation | None = None
 ) -> CheckedFile:
-    """Test if some point of a feasible set has the base values of a parameter file (BPFT, eq. 51).
+    """Test if the base values of a parameter file are those of some point of a feasible set (BPFT, eq. 51).
 
     Args:
         path: the file.
@@ -201,7 +201,7 @@ KEPT = (DOCUMENT, TEXT, PAGE)
 
 
 def compare_files(paths: Sequence[Path], out: Path | None = None) -> tuple[Comparison, tuple[Path, ...]]:
-    """Compare results with the first of them; return (comparison, files written, none without `out`).
+    """Compare results with the first of them, into a folder or `.json` if given; return (comparison, files written).
 
     Args:
         paths: two or more.

@@ -129,7 +129,7 @@ def open_for_arm(
     torque: Torque | None = None,
     payload: Payload | None = None,
 ) -> Recording:
-    """Open a recording, or a range of one, for an arm, without what followed where the motion was stopped.
+    """Open a recording, or a range of one, for an arm; leave out what follows a stop, and standstill and ends if asked.
 
     Args:
         path: the file, or `FILE@START:END`.
@@ -247,7 +247,7 @@ def known_payloads(files: Mapping[Path, Path], recordings: Sequence[Path], model
 
 
 def removed_standstill(recording: Recording) -> tuple[float, float]:
-    """Return how much standstill was left out at the start and at the end [s]."""
+    """Return how much standstill opening left out at the start and at the end [s]; zeros if it left none out."""
     return recording.standstill if isinstance(recording, RangeRecording) else (0.0, 0.0)
 
 

@@ -73,7 +73,7 @@ class Recovery:
 
 
 def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str | None = None) -> Recovery:
-    """Read an arm's state, reset its drives if no process has it and all faults are acknowledged; list the next steps.
+    """Watch an arm that no process has, reset tripped drives if all faults are acknowledged; return what to do next.
 
     Args:
         config: of the arm.
@@ -125,7 +125,7 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str 
 
 
 def release_held_drives(config: ArmConfig, state: Path) -> tuple[str, ...]:
-    """Switch off drives that hold an arm in quick stop, which a person has confirmed as supported; return the axes.
+    """Switch off drives that hold an arm in quick stop; a person must have confirmed its support; return the axes.
 
     Args:
         config: of the arm.
@@ -291,7 +291,7 @@ def home_posture(config: ArmConfig) -> tuple[JointPosture, ...]:
 
 
 def set_home(config: ArmConfig, state: Path, confirm: Callable[[str], str], arm: Arm | None = None) -> ZeroingResult:
-    """Set an arm's present position as its home in the drives if a person confirms it; delete the arm's ticket.
+    """Set an arm's present position as its home in the drives, delete its ticket; MotionRefused if nobody confirms.
 
     Args:
         config: of the arm.

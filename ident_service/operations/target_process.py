@@ -70,7 +70,7 @@ def watch(folder: Path, target: Target, least: float) -> dict[str, Any] | None:
 
 
 def missed(folder: Path, target: Target, period: float) -> list[dict[str, Any]]:
-    """Return expression and share of the chosen parameters that a run's whole recording leaves less known than asked.
+    """List `parameter` and `share` of the chosen parameters whose deviation a run's recording leaves above the target.
 
     Args:
         folder: folder of the run, which is over.

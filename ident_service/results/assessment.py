@@ -63,7 +63,7 @@ class JointAssessment:
         return self.unseen_moving if self.unseen is not None else self.fitted_moving
 
     @property
-    def in_motion(self) -> bool:
+    def poor_in_motion(self) -> bool:
         """Return whether the torque error away from standstill is above `POOR` percent, or not known."""
         return self.moving is None or self.moving > POOR
 
@@ -248,7 +248,7 @@ def joints_in_words(joints: Sequence[JointAssessment]) -> str:
     """Format each joint with its torque error in percent, and that away from standstill where it is small there."""
     return ", ".join(
         f"{one.joint} ({_percent(one.whole)}"
-        + (")" if one.in_motion or one.moving is None else f"; {_percent(one.moving)} away from standstill)")
+        + (")" if one.poor_in_motion or one.moving is None else f"; {_percent(one.moving)} away from standstill)")
         for one in joints
     )
 
@@ -286,9 +286,9 @@ def _prediction(content: Mapping[str, Any], joints: Sequence[JointAssessment]) -
         return [(1, "How well it predicts torque is unknown.")]
     found: Weighted = []
     poor = [one for one in joints if one.whole > POOR]
-    if moving := [one for one in poor if one.in_motion]:
+    if moving := [one for one in poor if one.poor_in_motion]:
         found.append((1, f"Off by more than {POOR:g} % of their own torque: {joints_in_words(moving)}."))
-    if still := [one for one in poor if not one.in_motion]:
+    if still := [one for one in poor if not one.poor_in_motion]:
         said = f"Off by more than {POOR:g} % of their own torque, near standstill only: {joints_in_words(still)}."
         found.append((1, said))
     if not content.get("validation") and (held_out := content.get("fleet", {}).get("held_out_percent")) is not None:

@@ -155,7 +155,7 @@ def named_files(folder: Path) -> Mapping[str, str]:
 
 
 def verified_files(folder: Path, *, but: frozenset[str] = frozenset()) -> Mapping[str, str]:
-    """Return name to SHA-256 of a manifest's files; raise unless each is a regular file with that hash.
+    """Return name to SHA-256 of a manifest's files; raise unless each is there with that hash, or gone and in `but`.
 
     Args:
         folder: folder to be read.
@@ -207,7 +207,7 @@ _NAMED = 3
 
 
 def require_replaceable(folder: Path) -> None:
-    """Raise UsageError if a folder cannot be written or holds anything but an earlier result; absent is fine.
+    """Raise UsageError if a folder cannot be written or holds anything but an unchanged earlier result; absent is fine.
 
     Raises:
         UsageError: it is a file, lies where nothing can be written, or holds what is no earlier result; with what it

@@ -179,7 +179,7 @@ def payload_text(payload: Payload, arm: KnownArm) -> str:
 
 
 def rounded(values: Array) -> Array:
-    """Return the ten parameters of a body, those set to zero that are rounding beside the largest of their quantity."""
+    """Return a body's ten parameters, zero for those that are only rounding beside the largest of their quantity."""
     shown = np.array(values, dtype=float)
     for quantity in (slice(0, 6), slice(6, 9), slice(9, 10)):
         part = shown[quantity]

@@ -95,7 +95,7 @@ class Postures:
 
 
 def draw_obstacle(canvas: Canvas, axes: Axes, view: tuple[int, int], obstacle: Solid) -> tuple[float, float] | None:
-    """Draw an obstacle; return the middle of what is seen of it [px], or None where the view does not meet it."""
+    """Draw an obstacle; return the middle of what is seen of it [px], or None where no edge of it is in view."""
     if isinstance(obstacle, Capsule):
         ends = corners(obstacle)[0][:, list(view)]
         (xa, xb), (ya, yb) = axes.x(ends[:, 0]), axes.y(ends[:, 1])
@@ -276,7 +276,7 @@ def _views(postures: Postures, shown: Sequence[int], form: _Format) -> Canvas:
 def spike_figure(
     mechanism: Chain, joint: int, time: float, residual: float, position: Array, *, inline: bool = False
 ) -> str:
-    """Draw the posture with a joint's largest residual, the joint marked, from two sides; return the SVG.
+    """Draw the arm at `position`, where a joint's residual is largest, from two sides, the joint marked; return SVG.
 
     Args:
         mechanism: of the arm.
@@ -318,7 +318,7 @@ _PICTURE_WIDTH, _PICTURE_HEIGHT, _PICTURE_MARGIN = 280.0, 210.0, 12.0
 
 
 def silhouette(limbs: Sequence[Limb], title: str) -> str:
-    """Draw an arm in one posture, from the side and above, as a small picture without scales; return the SVG.
+    """Draw an arm in one posture, seen at a slant from above, as a small picture without scales; return the SVG.
 
     Args:
         limbs: parts of the arm, one at least.

@@ -43,7 +43,7 @@ def write_report(
     validation: Sequence[Recording],
     warnings: Sequence[str],
 ) -> list[str]:
-    """Write evidence and report into a folder with the estimate's other files, before its manifest; return names.
+    """Write evidence and report into a folder beside the estimate's other files, no manifest; return their names.
 
     Args:
         folder: folder that `write_results` has written.

@@ -77,7 +77,7 @@ def write_results(
     described: ArmConfig | None = None,
     torque: str = "commanded",
 ) -> list[str]:
-    """Write an estimate's files, and the program that checks its certificate, into a folder; return their names.
+    """Write an estimate's files and its certificate's verifier into a folder, no manifest; return their names.
 
     Args:
         folder: folder to write.

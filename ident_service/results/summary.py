@@ -91,7 +91,7 @@ def noise_and_model(noise: Array | None, variances: Array) -> str:
 
 
 def wrapped(sentences: Iterable[str]) -> list[str]:
-    """Wrap sentences into lines of at most 100 characters, those that go on indented."""
+    """Wrap each sentence into lines of at most 100 characters, all but its first indented."""
     return [line for sentence in sentences for line in textwrap.wrap(sentence, 100, subsequent_indent="  ")]
 
 

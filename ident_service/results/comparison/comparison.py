@@ -225,7 +225,7 @@ def values_in_use(
     places: Sequence[NDArray[np.intp]],
     compared: tuple[ComparedEstimate, ComparedEstimate] | None,
 ) -> AppliedValues:
-    """Return both sides' values in use, whether others were tested, and by what share they change torques.
+    """Return both sides' values in use, whether the tests used others, and what share of torque they differ by.
 
     Args:
         sides: the reference and the other.
@@ -293,7 +293,7 @@ class Pair:
 
     @property
     def verdict(self) -> Verdict:
-        """Return `changed`, `unchanged` or `impossible`; the last, too, where friction left out could hide a change."""
+        """Return `changed`, `unchanged` or `impossible`: untested, or unchanged but for friction that was left out."""
         if self.drift is None or (self.drift.verdict == "unchanged" and self.other_shape):
             return "impossible"
         return self.drift.verdict
@@ -534,7 +534,7 @@ class Finding:
 
 
 def findings(pair: Pair) -> tuple[Finding, ...]:
-    """Return the changes between the reference and a side; empty where nothing has changed."""
+    """Return the changes between the reference and a side; empty unless the verdict is `changed`."""
     found, compared = pair.drift, pair.compared
     if found is None or compared is None or found.verdict != "changed":
         return ()

@@ -56,13 +56,13 @@ _GOOD = {
 }
 
 
-def friction_curves(reference: ComparedSet, pair: Pair, place: int) -> list[Figure]:
+def friction_curves(reference: ComparedSet, pair: Pair, pair_number: int) -> list[Figure]:
     """Draw the friction torque of both sides against velocity, one figure per joint that has friction on both.
 
     Args:
         reference: the first side.
         pair: the other one.
-        place: number of the pair, from 1, for the figures' names.
+        pair_number: number of the pair, from 1, for the figures' names.
     """
     ours, theirs = (_friction(side) for side in (reference, pair.side))
     figures = []
@@ -85,7 +85,7 @@ def friction_curves(reference: ComparedSet, pair: Pair, place: int) -> list[Figu
         words = f"{joint_name(pair, joint)}: the curves differ by {most:.3g} {torque} at most, by the values in use."
         figures.append(
             Figure(
-                slug=f"friction-{place}-{joint}",
+                slug=f"friction-{pair_number}-{joint}",
                 title=f"{joint_name(pair, joint)}: friction of both against velocity",
                 description=words,
                 caption=words,
@@ -95,7 +95,7 @@ def friction_curves(reference: ComparedSet, pair: Pair, place: int) -> list[Figu
     return figures
 
 
-def z_figure(found: ParameterChange, place: int) -> Figure:
+def z_figure(found: ParameterChange, pair_number: int) -> Figure:
     """Draw every parameter's difference in standard deviations, on a scale that shows 1 as well as 1000."""
     size = len(found.z)
     shown = _squeezed(np.clip(found.z, -_LARGEST_Z, _LARGEST_Z))
@@ -125,7 +125,7 @@ def z_figure(found: ParameterChange, place: int) -> Figure:
         f"{count} of {size} parameters differ significantly; the largest |z| is {float(np.max(np.abs(found.z))):.3g}."
     )
     return Figure(
-        slug=f"z-{place}",
+        slug=f"z-{pair_number}",
         title="Difference of every base parameter in standard deviations",
         description=words,
         caption=words,

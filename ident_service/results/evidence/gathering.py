@@ -132,7 +132,7 @@ _GAP = 1.9  # times the usual step; a longer step is a gap
 
 
 def timing(recording: Recording) -> Timing:
-    """Return rate, jitter and gaps of a recording's samples, from the loop's own account where there is one.
+    """Return rate, jitter and gaps of a recording, from its `/cycle` where a whole run has one, else from its stamps.
 
     Args:
         recording: of two samples at least.
@@ -421,7 +421,7 @@ class FrictionCollector:
         self._points = Scatter()
 
     def add(self, rows: Rows, torque: Array) -> None:
-        """Add velocity and non-rigid torque of each drive; `torque` as the estimate counts it, (samples, joints)."""
+        """Add velocity and non-rigid torque of each drive; `torque`, (samples, joints), has torque scales applied."""
         if not self._places or not len(rows.time):
             return
         rigid = np.tensordot(self._estimate.beta[self._rigid], rows.H_b[:, self._rigid], axes=(0, 1)).T

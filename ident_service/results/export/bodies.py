@@ -11,7 +11,7 @@ from ident_service.model.parameter_layout import about_center, body_parameters, 
 
 
 def moved(parameters: Array, rotation: Array, translation: Array) -> Array:
-    """Return a body's ten parameters of eq. 13, shape (10,), in another frame.
+    """Return a body's ten parameters of eq. 13, (10,), in another frame, in which its own has the pose given.
 
     Args:
         parameters: parameters of eq. 13, shape (10,).

@@ -39,12 +39,12 @@ _HEADER = ("kind", "name", "unit", "value", "sigma", "verdict", "unconstrained_v
 _LEAST_MASS = 1e-3  # [kg]
 
 
-def csv_export(arm: IdentifiedArm, name: str) -> str:
+def csv_export(arm: IdentifiedArm, file_name: str) -> str:
     """Return all parameters as a CSV table, in which all digits of the numbers are kept.
 
     Args:
         arm: arm, with link parameters or without.
-        name: of the file, for errors.
+        file_name: name of the file, for errors.
 
     Raises:
         ModelError: the table read back differs.
@@ -69,7 +69,7 @@ def csv_export(arm: IdentifiedArm, name: str) -> str:
     found = [row["value"] for row in csv.DictReader(io.StringIO(text.getvalue()))][len(arm.forbidden) :]
     meant = [*arm.beta.tolist(), *([] if arm.delta is None else arm.delta.tolist()), *(value for *_, value in shape)]
     if [float(value) for value in found] != meant:
-        raise ModelError(f"{name}: the table read back differs from the parameters; it was not written")
+        raise ModelError(f"{file_name}: the table read back differs from the parameters; it was not written")
     return text.getvalue()
 
 
@@ -89,18 +89,18 @@ def _friction_shape(arm: IdentifiedArm) -> list[tuple[str, str, float]]:
 _FORMAT, _VERSION = "ident-dynamics", 1
 
 
-def json_export(arm: IdentifiedArm, name: str) -> str:
-    """Return the arm as JSON, after the same torques were computed from it.
+def json_export(arm: IdentifiedArm, file_name: str) -> str:
+    """Return the arm as JSON; ModelError unless the same torques can be computed from it.
 
     Args:
         arm: arm, with link parameters or without.
-        name: of the file, for errors.
+        file_name: name of the file, for errors.
 
     Raises:
         ModelError: a link without positive mass, or the file does not say what it should.
     """
     text = json.dumps(_document(arm), indent=1, allow_nan=False) + "\n"
-    _check(arm, text, name)
+    _check(arm, text, file_name)
     return text
 
 

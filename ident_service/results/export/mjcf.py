@@ -33,14 +33,14 @@ _ATTRIBUTES = dict(zip(JOINT_TERMS, ("armature", "damping", "frictionloss"), str
 
 
 def mjcf_export(
-    model: ArmModel, delta: Array, name: str, said: tuple[str, ...] = (), motion: RecordedMotion | None = None
+    model: ArmModel, delta: Array, file_name: str, said: tuple[str, ...] = (), motion: RecordedMotion | None = None
 ) -> tuple[str, tuple[str, ...]]:
     """Return (MJCF text, what it does not carry), after pinocchio has read it back with the same torques.
 
     Args:
         model: the arm.
         delta: link parameters, shape (layout.size,).
-        name: of the file, for errors.
+        file_name: name of the file, for errors.
         said: statements about its bodies, for a comment in it.
         motion: motion that the arm was identified from, which says how large the torque of what is lost is.
 
@@ -56,9 +56,9 @@ def mjcf_export(
     if any(joint.velocity is not None for joint in model.config.joints.values()):
         lost = (*lost, "velocity limits")
     text = _text(model, delta, has, shared, lost, said)
-    written = read_back(TextFile(name=name, text=text), "mjcf", gravity_of(model))
-    require_same_torques(model, delta, written, has, name)
-    _require_same_tendons(model, delta, text, shared, name)
+    written = read_back(TextFile(name=file_name, text=text), "mjcf", gravity_of(model))
+    require_same_torques(model, delta, written, has, file_name)
+    _require_same_tendons(model, delta, text, shared, file_name)
     return text, lost
 
 

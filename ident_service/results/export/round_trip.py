@@ -64,13 +64,13 @@ def with_terms(model: ArmModel, delta: Array, terms: Collection[JointTerm]) -> A
 
 
 def supported_terms(model: ArmModel, delta: Array, terms: Collection[JointTerm]) -> Carried:
-    """Map each joint term of a format to a mask of the joints whose value it supports: not negative, with own drive."""
+    """Map each joint term of a format to a mask of the joints whose value it can hold: not negative, with own drive."""
     drives = joint_drives(model.chain, model.layout, delta)
     known = [term for term in JOINT_TERMS if term in terms and term in model.layout.terms]
     return {term: drives.own & (drives.of(term) >= 0.0) for term in known}
 
 
-def require_same_torques(model: ArmModel, delta: Array, written: WrittenArm, has: Carried, name: str) -> None:
+def require_same_torques(model: ArmModel, delta: Array, written: WrittenArm, has: Carried, file_name: str) -> None:
     """Raise ModelError unless an arm read from a file predicts the parameters' torques, in the terms that it carries.
 
     Args:
@@ -78,12 +78,12 @@ def require_same_torques(model: ArmModel, delta: Array, written: WrittenArm, has
         delta: link parameters, shape (layout.size,).
         written: arm that was read back.
         has: terms that the file carries.
-        name: of the file.
+        file_name: name of the file.
 
     Raises:
         ModelError: other joints, or other torques.
     """
-    refused = f"{name}: what is read back differs from the parameters"
+    refused = f"{file_name}: what is read back differs from the parameters"
     if sorted(written.chain.names) != sorted(model.chain.names):
         raise ModelError(f"{refused}: its joints are {', '.join(written.chain.names)}; it was not written")
     order = [written.chain.names.index(joint) for joint in model.chain.names]

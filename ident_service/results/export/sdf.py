@@ -40,13 +40,13 @@ _ENTITIES = {"&quot;": '"', "&apos;": "'"}
 
 
 def read_sdf(
-    text: str, name: str, gravity: tuple[float, float, float], joint_names: Mapping[str, str] | None = None
+    text: str, file_name: str, gravity: tuple[float, float, float], joint_names: Mapping[str, str] | None = None
 ) -> WrittenArm:
     """Read an SDF model of revolute, continuous and prismatic joints that stands on `world`; raise for any other.
 
     Args:
         text: the file.
-        name: of the file, for errors.
+        file_name: name of the file, for errors.
         gravity: gravity of the world that the model is put in [m/s^2].
         joint_names: other names for its joints.
 
@@ -54,9 +54,9 @@ def read_sdf(
         ModelError: not such a model.
     """
     try:
-        return _Reader(text, name).arm(gravity, joint_names or {})
+        return _Reader(text, file_name).arm(gravity, joint_names or {})
     except (KeyError, ValueError, StopIteration) as error:
-        raise ModelError(f"{name}: not an SDF arm that can be read: {error!r}") from None
+        raise ModelError(f"{file_name}: not an SDF arm that can be read: {error!r}") from None
 
 
 class _Reader:
@@ -163,14 +163,14 @@ _ENTRIES = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (
 
 
 def sdf_export(
-    model: ArmModel, delta: Array, name: str, said: tuple[str, ...] = (), motion: RecordedMotion | None = None
+    model: ArmModel, delta: Array, file_name: str, said: tuple[str, ...] = (), motion: RecordedMotion | None = None
 ) -> tuple[str, tuple[str, ...], tuple[str, ...]]:
     """Return (SDF text, what it does not carry, notes), after it was read back with the same torques.
 
     Args:
         model: the arm.
         delta: link parameters, shape (layout.size,).
-        name: of the file, for errors.
+        file_name: name of the file, for errors.
         said: statements about its bodies, for a comment in it.
         motion: motion that the arm was identified from, which says how large the torque of what is lost is.
 
@@ -182,8 +182,8 @@ def sdf_export(
     lost = (*gravity, *unsupported_terms(model, delta, has, motion))
     joints = _names(model)
     text = _text(model, delta, has, joints, lost, said)
-    written = read_sdf(text, name, gravity_of(model), dict(zip(joints, model.chain.names, strict=True)))
-    require_same_torques(model, delta, written, has, name)
+    written = read_sdf(text, file_name, gravity_of(model), dict(zip(joints, model.chain.names, strict=True)))
+    require_same_torques(model, delta, written, has, file_name)
     renamed = [f"{own} is called {new}" for own, new in zip(model.chain.names, joints, strict=True) if own != new]
     return text, lost, tuple(renamed)
 

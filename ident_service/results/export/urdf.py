@@ -90,7 +90,7 @@ class Edit:
     text: str
 
 
-def xml_places(text: str, name: str) -> Element:
+def xml_places(text: str, file_name: str) -> Element:
     """Parse XML into elements that know their places [bytes] in the text; return the root, others are its children.
 
     Raises:
@@ -109,7 +109,7 @@ def xml_places(text: str, name: str) -> Element:
         (open_elements[-1].children if open_elements else roots).append(element)
         open_elements.append(element)
         if len(open_elements) > _DEEPEST:
-            raise ModelError(f"{name}: more than {_DEEPEST} elements in one another")
+            raise ModelError(f"{file_name}: more than {_DEEPEST} elements in one another")
 
     def finish(_: str) -> None:
         element = open_elements.pop()
@@ -120,14 +120,14 @@ def xml_places(text: str, name: str) -> Element:
             element.end = _end_of_tag(data, element.foot)
 
     def refuse(*_: object) -> None:
-        raise ModelError(f"{name}: a document type or entities are refused; give one self-contained file")
+        raise ModelError(f"{file_name}: a document type or entities are refused; give one self-contained file")
 
     parser.StartElementHandler, parser.EndElementHandler = begin, finish
     parser.StartDoctypeDeclHandler = parser.EntityDeclHandler = refuse
     try:
         parser.Parse(data, True)
     except expat.ExpatError as error:
-        raise ModelError(f"{name}: not XML: {error}") from None
+        raise ModelError(f"{file_name}: not XML: {error}") from None
     return roots[0]
 
 
@@ -146,7 +146,7 @@ def _end_of_tag(data: bytes, start: int) -> int:
 
 
 def edited(text: str, edits: Sequence[Edit]) -> str:
-    """Return the text with its byte ranges replaced as the edits say, which do not overlap; at one place in order."""
+    """Return the text with the byte ranges of the edits replaced by their texts; the ranges must not overlap."""
     data, parts, at = text.encode("utf-8"), [], 0
     for edit in sorted(edits, key=lambda edit: (edit.start, edit.end)):
         parts += [data[at : edit.start], edit.text.encode("utf-8")]
@@ -158,7 +158,7 @@ _WHITESPACE = str.maketrans({"\n": "&#10;", "\r": "&#13;", "\t": "&#9;"})  # a p
 
 
 def start_tag(tag: str, attributes: Mapping[str, str], *, closed: bool = True) -> str:
-    """Return a start tag, or a whole element without content."""
+    """Return a whole element without content, `<tag .../>`, or with `closed=False` a start tag, `<tag ...>`."""
     listed = "".join(f' {key}="{escape(value).translate(_WHITESPACE)}"' for key, value in attributes.items())
     return f"<{tag}{listed}{'/' if closed else ''}>"
 
@@ -382,14 +382,14 @@ _TERMS: tuple[JointTerm, ...] = ("viscous", "coulomb")
 
 
 def urdf_export(
-    model: ArmModel, delta: Array, name: str, said: tuple[str, ...] = (), motion: RecordedMotion | None = None
+    model: ArmModel, delta: Array, file_name: str, said: tuple[str, ...] = (), motion: RecordedMotion | None = None
 ) -> tuple[str, tuple[str, ...], tuple[str, ...]]:
     """Return (URDF text, what it does not carry, notes), after pinocchio has read it back with the same torques.
 
     Args:
         model: the arm.
         delta: link parameters, shape (layout.size,).
-        name: of the file, for errors.
+        file_name: name of the file, for errors.
         said: statements about its bodies, for a comment at its end.
         motion: motion that the arm was identified from, which says how large the torque of what is lost is.
 
@@ -410,8 +410,8 @@ def urdf_export(
     gravity = "gravity" if model.chain.gravity.any() else ""
     unwritten = unsupported_terms(model, delta, has, motion)
     text = _commented(text, (*presliding_left_out(model, delta), *said))
-    written = read_back(TextFile(name=name, text=text), "urdf", gravity_of(model), own)
-    require_same_torques(model, delta, written, has, name)
+    written = read_back(TextFile(name=file_name, text=text), "urdf", gravity_of(model), own)
+    require_same_torques(model, delta, written, has, file_name)
     return text, tuple(filter(None, (gravity, *unwritten))), notes
 
 

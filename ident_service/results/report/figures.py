@@ -265,7 +265,7 @@ _RESIDUAL_TOP, _RESIDUAL_HEIGHT, _RESIDUAL_BETWEEN, _RESIDUAL_BOTTOM = 42.0, 120
 
 
 def residual_figures(evidence: Evidence) -> list[Figure]:
-    """Draw spectrum and autocorrelation of each joint's residual, for one recording fitted to and one not."""
+    """Draw spectrum and autocorrelation of the residual, a figure per joint, of one recording fitted to and one not."""
     shown = []
     for role in ("identification", "validation"):
         shown += [one for one in evidence.recordings if one.role == role and one.spectra][:1]
@@ -693,7 +693,7 @@ def _bodies_figure(joints: tuple[str, ...], posed: PosedArm, name: str, view: tu
 
 
 def bodies_words(evidence: Evidence) -> str:
-    """Return the masses of the links, and which bodies no drawing holds; empty where there are no link parameters."""
+    """Describe the masses of the links, and which bodies no drawing holds; empty where there are no link parameters."""
     return "" if evidence.posed is None else _words(evidence.joints, evidence.posed, _shown(evidence.posed))
 
 

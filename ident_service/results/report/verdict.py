@@ -184,12 +184,12 @@ def next_steps(evidence: Evidence, parameters: ParameterFile) -> list[str]:
     elif generalises_poorly(parameters.content):
         steps.append("see below which joint's residual follows the motion, and identify from a richer motion")
     poor = poor_joints(parameters.content)
-    if moving := [one.joint for one in poor if one.in_motion]:
+    if moving := [one.joint for one in poor if one.poor_in_motion]:
         steps.append(
             f"do not rely on the predicted torque of {', '.join(moving)}: see below whether residual and friction ask "
             "for another friction term, and record a motion that moves and loads them more"
         )
-    if still := [one.joint for one in poor if not one.in_motion]:
+    if still := [one.joint for one in poor if not one.poor_in_motion]:
         steps.append(f"use it where joints move, not for the torque near standstill of {', '.join(still)}")
     if active_constraints_text(evidence, parameters):
         steps.append("find out why constraints are active: signs, units, friction, drive inertia")
