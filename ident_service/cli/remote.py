@@ -111,7 +111,7 @@ def carrying(words: str, verb: Verb) -> RemoteVerb:
 def job(
     words: str, kind: str | None = None, *, more: str = "", ended: Ended | None = None, **fields: Reader
 ) -> RemoteVerb:
-    """Return a remote verb that runs a job, with the arguments named in `words` and those of `fields` as its fields.
+    """Return a remote verb that runs a job; the job's fields are the arguments named in `words` and what `fields` read.
 
     Args:
         words: arguments that are fields of the job under their own names.
@@ -154,7 +154,7 @@ def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
 
 @contextmanager
 def telling_of_arm(arm: str, job: str) -> Iterator[None]:
-    """Re-raise an ArmError of the block, which says that the daemon is gone, adding how the arm stops by itself."""
+    """In the block, add to the ArmError of a daemon that is gone how the arm stops by itself."""
     from ident_service.client import left_alone
 
     try:
