@@ -104,7 +104,7 @@ def table() -> dict[str, RemoteVerb]:
 
 
 def carrying(words: str, verb: Verb) -> RemoteVerb:
-    """Pair the function of a remote verb with the set of arguments, named in `words` with spaces, that it sends."""
+    """Return (function of a remote verb, set of the arguments that it sends), these from `words`, divided by spaces."""
     return verb, frozenset(words.split())
 
 
@@ -166,7 +166,7 @@ def telling_of_arm(arm: str, job: str) -> Iterator[None]:
 
 
 def job_verb(make: Callable[[IdentClient, argparse.Namespace], dict[str, Any]], ended: Ended | None = None) -> Verb:
-    """Return a function that queues a job on the daemon, waits for its end, and returns the verb's answer.
+    """Return a verb's function: it queues a job (if the arm moves, confirmed first), waits for its end, and answers.
 
     Args:
         make: the job of the words; its kind is the verb if it does not say another.
@@ -351,7 +351,7 @@ def follow(
     ours: bool = True,
     every: float = _LOOK,
 ) -> dict[str, Any]:
-    """Poll a job to its end, print its phases, renew its lease, cancel it once `over()`; return it as last seen.
+    """Poll a job to its end, print its phases, renew its lease, cancel it if `ours` once `over()`; return it.
 
     Args:
         client: of the daemon.

@@ -85,7 +85,7 @@ class Connections:
 
     @property
     def full(self) -> bool:
-        """Return whether open and closing connections are together as many as may be, so that none is accepted."""
+        """Return whether no more connections are accepted, because too many are open or not yet wholly closed."""
         return len(self._open) + self._leaving >= self._most + _LEAVING
 
     def busy(self, peer: Peer | None) -> bool:
