@@ -360,7 +360,7 @@ class FairReader(H11Protocol):
             self.go_on()
 
     def send_400_response(self, msg: str) -> None:
-        """Answer a mistake of the client; what the application answers to the torn request is dropped."""
+        """Answer 400 to a mistake of the client, and drop what the application answers to the broken request."""
         super().send_400_response(msg)
         self._drop_answer()
 

@@ -154,7 +154,7 @@ async def lease_keeper(request: Request, bearer: Bearer = None, cookie: Cookie =
 
 
 async def while_authorised(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> WhileKnown:
-    """Return a filter that ends an event stream when its token or session is no longer valid."""
+    """Return a filter that ends an event stream, at its next event, once its token or session is no longer valid."""
     authenticator, secret = service_of(request).authenticator, None if bearer is None else bearer.credentials
 
     async def while_known(events: AsyncIterator[str]) -> AsyncIterator[str]:
