@@ -184,7 +184,7 @@ class LiveJobs:
         return self._thread.is_alive()
 
     def add(self, live: LiveJob, stops: int | None = None) -> None:
-        """Put a job into the queue; raise MotionRefused while closing, after a later stop, or if it must not wait.
+        """Queue a job; raise MotionRefused while closing, after a later stop, or if it would have to wait and must not.
 
         Args:
             live: the job.
