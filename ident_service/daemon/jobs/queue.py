@@ -266,7 +266,7 @@ class LiveJobs:
         return live.job in self._jobs
 
     def free(self, live: LiveJob, computing: int) -> bool:
-        """Return whether a job may begin: its resources are free of earlier jobs; without any, a place is free.
+        """Return whether a job may begin: no earlier one uses its resources; without any, fewer than `computing` run.
 
         Args:
             live: the job.
