@@ -203,7 +203,7 @@ async def renew_lease(service: Serving, who: LeaseKeeper, job: Id) -> answers.Le
 
 @router.post("/stop")
 async def stop_all(service: Serving, who: Near) -> answers.StopAnswer:
-    """Stop all arms, under control, without waiting; needs no role, on the service's own machine no token."""
+    """Stop all arms, under control, without waiting; by any token, or by none where the service listens at loopback."""
     return await _stop(service, None, who)
 
 
