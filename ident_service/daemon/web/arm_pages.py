@@ -472,7 +472,7 @@ def finish(service: Serving, who: Operator, arm: ArmName, form: Form) -> Respons
 
 @router.post("/arms/{arm}/supported")
 def supported(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
-    """Confirm, on a person's word, that an arm that is held is supported."""
+    """Confirm that an arm that is held is supported, if the form has the arm's name, typed by a person."""
     arms.supported(service, who, arm, arms.Support(confirm=form.get("name", "").strip()))
     return _back(service, arm, form)
 
