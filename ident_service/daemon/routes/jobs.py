@@ -209,7 +209,7 @@ async def stop_all(service: Serving, who: Near) -> answers.StopAnswer:
 
 @router.post("/arms/{arm}/stop")
 async def stop_arm(service: Serving, who: Near, arm: ArmName) -> answers.StopAnswer:
-    """Stop one arm, under control; whoever may stop all may stop one. 404 for an unknown arm, none for one at rest."""
+    """Stop one arm, under control, for whoever may stop all; 404 for an unknown arm, no error for one at rest."""
     return await _stop(service, arm, who)
 
 
