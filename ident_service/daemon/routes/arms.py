@@ -288,7 +288,7 @@ def delete_motion(
 
 @router.delete("/arms/{arm}", responses=failures(404, 409))
 def delete_arm(service: Serving, who: Operator, arm: ArmName, anyway: answers.Anyway = False) -> answers.DeletionAnswer:
-    """Delete an uploaded arm, with `anyway` all its motions, runs, schedules and acceptances too."""
+    """Delete an uploaded arm; one with motions, runs, schedules or acceptances only with `anyway`, these with it."""
     return answers.deletion_answer(arm, deletion.delete_arm(service.db, service.state, arm, who.name, anyway=anyway))
 
 
