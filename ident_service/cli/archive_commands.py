@@ -280,14 +280,14 @@ def _delete(arguments: argparse.Namespace) -> Answer:
 
     kind = arguments.kind
     delete = {"run": deletion.delete_run, "motion": deletion.delete_motion, "arm": deletion.delete_arm}[kind]
-    with registry(arguments) as (db, state), deleted_with_anyway(kind, arguments.name):
+    with registry(arguments) as (db, state), hint_at_anyway(kind, arguments.name):
         found = delete(db, state, arguments.name, terminal_user(arguments), anyway=arguments.anyway)
     return told(arguments, {"deleted": arguments.name, "dependents": [asdict(one) for one in found]})
 
 
 @contextmanager
-def deleted_with_anyway(kind: str, name: str) -> Iterator[None]:
-    """Add `ident KINDs delete NAME --anyway`, the command that deletes all the same, to an InUse error of the block."""
+def hint_at_anyway(kind: str, name: str) -> Iterator[None]:
+    """In the block, add to an InUse error the command that deletes all the same, `ident KINDs delete NAME --anyway`."""
     try:
         yield
     except InUse as error:

@@ -51,7 +51,7 @@ class Mark:
 
 
 def estimate(begun: float, first: Mark, mark: Mark, now: float) -> tuple[float | None, float | None]:
-    """Return (share that is done, time left [s]), extrapolated from the marks; None for what cannot be known.
+    """Return (share done, time left [s]) by the last mark's own time left, else by the pace between marks; or None.
 
     Args:
         begun: time when the command began [s].
@@ -188,7 +188,7 @@ def _rich_bar() -> Progress:
 
 
 def progress_bar(arguments: argparse.Namespace) -> ProgressBar:
-    """Create the bar of a verb, which draws on a terminal only, and keep it as `arguments.progress` for `step_of`."""
+    """Create a verb's bar and set `arguments.progress` to it; it draws only on a terminal, and not for quick verbs."""
     terminal = sys.stderr is not None and sys.stderr.isatty() and not arguments.json
     silent = arguments.word in _WITHOUT | _AT_ONCE or getattr(arguments, "hold_to_run", False)
     bar = arguments.progress = ProgressBar(f"ident {arguments.word}", wanted=terminal and not silent)

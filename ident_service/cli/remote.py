@@ -104,14 +104,14 @@ def table() -> dict[str, RemoteVerb]:
 
 
 def carrying(words: str, verb: Verb) -> RemoteVerb:
-    """Pair the function of a remote verb with the set of arguments, named in `words` with spaces, that it sends."""
+    """Return (function of a remote verb, set of the arguments that it sends), these from `words`, divided by spaces."""
     return verb, frozenset(words.split())
 
 
 def job(
     words: str, kind: str | None = None, *, more: str = "", ended: Ended | None = None, **fields: Reader
 ) -> RemoteVerb:
-    """Return a remote verb that runs a job, with the arguments named in `words` and those of `fields` as its fields.
+    """Return a remote verb that runs a job; the job's fields are the arguments named in `words` and what `fields` read.
 
     Args:
         words: arguments that are fields of the job under their own names.
@@ -154,7 +154,7 @@ def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
 
 @contextmanager
 def telling_of_arm(arm: str, job: str) -> Iterator[None]:
-    """Re-raise an ArmError of the block, which says that the daemon is gone, adding how the arm stops by itself."""
+    """In the block, add to the ArmError of a daemon that is gone how the arm stops by itself."""
     from ident_service.client import left_alone
 
     try:
@@ -166,7 +166,7 @@ def telling_of_arm(arm: str, job: str) -> Iterator[None]:
 
 
 def job_verb(make: Callable[[IdentClient, argparse.Namespace], dict[str, Any]], ended: Ended | None = None) -> Verb:
-    """Return a function that queues a job on the daemon, waits for its end, and returns the verb's answer.
+    """Return a verb's function: it queues a job (if the arm moves, confirmed first), waits for its end, and answers.
 
     Args:
         make: the job of the words; its kind is the verb if it does not say another.
@@ -351,7 +351,7 @@ def follow(
     ours: bool = True,
     every: float = _LOOK,
 ) -> dict[str, Any]:
-    """Poll a job to its end, print its phases, renew its lease, cancel it once `over()`; return it as last seen.
+    """Poll a job to its end, print its phases, renew its lease, cancel it if `ours` once `over()`; return it.
 
     Args:
         client: of the daemon.

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from ident_service.cli.answer_texts import reidentified_text, told
-from ident_service.cli.archive_commands import deleted_with_anyway
+from ident_service.cli.archive_commands import hint_at_anyway
 from ident_service.cli.identification_commands import OF_ARMS, accepted_name
 from ident_service.cli.output import DONE, FAILED, VERDICT_NO, Answer, StopOnSignal, tell
 from ident_service.cli.recovery_commands import EXIT_CODES
@@ -165,7 +165,7 @@ def _accept(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any
 
 def _delete(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     kind, name = arguments.kind, word_of_address(arguments.name)
-    with deleted_with_anyway(kind, name):
+    with hint_at_anyway(kind, name):
         return dict(client.delete(f"{_API}/{kind}s/{name}" + ("?anyway=true" if arguments.anyway else "")))
 
 

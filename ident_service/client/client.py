@@ -462,7 +462,7 @@ class RemoteMotion:
 
     @property
     def ended(self) -> Job:
-        """Return the job as it ended; raise UsageError before the `with` block has been left.
+        """Return the job as it ended, or as it was once its arm was held; raise UsageError inside the `with` block.
 
         Raises:
             UsageError: the block has not been left.

@@ -74,7 +74,7 @@ ROUTERS = (
 
 
 def create_app(settings: Settings, connections: Connections | None = None) -> FastAPI:
-    """Create the service as an ASGI application; its database is opened now, its queue runs during its lifespan.
+    """Create the service as an ASGI application: open its database, with a first token, now; run jobs in its lifespan.
 
     Args:
         settings: settings of the service.

@@ -85,7 +85,7 @@ class Connections:
 
     @property
     def full(self) -> bool:
-        """Return whether open and closing connections are together as many as may be, so that none is accepted."""
+        """Return whether no more connections are accepted, because too many are open or not yet wholly closed."""
         return len(self._open) + self._leaving >= self._most + _LEAVING
 
     def busy(self, peer: Peer | None) -> bool:
@@ -103,7 +103,7 @@ class Connections:
         return len(self._open)
 
     def admit(self, connection: Connection) -> bool:
-        """Admit a new connection, closing the longest waiting one if necessary; False where none can be closed."""
+        """Admit a new connection, closing, if need be, one that has long waited for a request; False if none waits."""
         host = connection.peer[0]
         if self._of_one[host] >= self._most_of_one:
             longest = next((peer for peer in self._waiting if peer[0] == host), None)
@@ -227,7 +227,7 @@ class Listener(socket.socket):
         self._book, self._accepted, self._gone = book, 0, 0
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """Return (socket, address) of the next admitted connection, closing refused ones; BlockingIOError if none.
+        """Return (socket, address) of the next admitted connection, closing refused ones; BlockingIOError if none now.
 
         Raises:
             BlockingIOError: nobody waits, or it is somebody else's turn in the event loop.
@@ -360,7 +360,7 @@ class FairReader(H11Protocol):
             self.go_on()
 
     def send_400_response(self, msg: str) -> None:
-        """Answer a mistake of the client; what the application answers to the torn request is dropped."""
+        """Answer 400 to a mistake of the client, and drop what the application answers to the broken request."""
         super().send_400_response(msg)
         self._drop_answer()
 

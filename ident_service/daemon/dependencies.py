@@ -119,7 +119,7 @@ async def operator(found: Annotated[Access, Depends(viewer)]) -> Access:
 
 
 async def local_or_authenticated(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> str:
-    """Return the name of a stop's caller by token or session, `anybody` without one on this machine; 401 for others.
+    """Return a stop's caller by token or session, or `anybody` if the service listens at loopback only; 401 for others.
 
     A stop does no harm, and whoever needs it may have no token at hand, or one that is out of date, or be throttled.
     From another machine it takes a token of any role, so that strangers on a network cannot keep an arm from working.
@@ -154,7 +154,7 @@ async def lease_keeper(request: Request, bearer: Bearer = None, cookie: Cookie =
 
 
 async def while_authorised(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> WhileKnown:
-    """Return a filter that ends an event stream when its token or session is no longer valid."""
+    """Return a filter that ends an event stream, at its next event, once its token or session is no longer valid."""
     authenticator, secret = service_of(request).authenticator, None if bearer is None else bearer.credentials
 
     async def while_known(events: AsyncIterator[str]) -> AsyncIterator[str]:

@@ -106,7 +106,7 @@ def printed_samples(folder: Path, offset: int) -> tuple[list[dict[str, Any]], in
 
 
 def outcome(output: ProcessOutput, exit_code: int | None, end_reason: str) -> Outcome:
-    """Decide an ended job's state, detail and exit code by its answer, else its exit code, and whether it was to end.
+    """Decide an ended job's state, detail and exit code: by its answer, else its exit code, and why it was to end.
 
     Args:
         output: of the process.

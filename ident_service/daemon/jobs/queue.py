@@ -184,7 +184,7 @@ class LiveJobs:
         return self._thread.is_alive()
 
     def add(self, live: LiveJob, stops: int | None = None) -> None:
-        """Put a job into the queue; raise MotionRefused while closing, after a later stop, or if it must not wait.
+        """Queue a job; raise MotionRefused while closing, after a later stop, or if it would have to wait and must not.
 
         Args:
             live: the job.
@@ -266,7 +266,7 @@ class LiveJobs:
         return live.job in self._jobs
 
     def free(self, live: LiveJob, computing: int) -> bool:
-        """Return whether a job may begin: its resources are free of earlier jobs; without any, a place is free.
+        """Return whether a job may begin: no earlier one uses its resources; without any, fewer than `computing` run.
 
         Args:
             live: the job.

@@ -41,7 +41,7 @@ _SAME = ("kinematics", "gravity", "terms", "transmission")  # sections whose cha
 
 
 def require_comparable(state: Path, config: ArmConfig) -> int:
-    """Return the number of an arm's current acceptance; raise if there is none, or its mechanism is not the arm's.
+    """Return the number of an arm's current acceptance; raise if there is none or the mechanism has changed since.
 
     Raises:
         UsageError: nothing was accepted; or the mechanism in the description is another one since.

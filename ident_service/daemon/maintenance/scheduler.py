@@ -50,7 +50,7 @@ class MaintenanceScheduler:
         self._thread = threading.Thread(target=self._work, name="maintenance", daemon=True)
 
     def start(self) -> None:
-        """Start the scheduler's thread, after the engine has marked what was interrupted; returns at once."""
+        """Start the scheduler's thread and return at once; call it after `Engine.start` has marked interrupted jobs."""
         self._thread.start()
 
     @property

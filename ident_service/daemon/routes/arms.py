@@ -134,7 +134,7 @@ def list_arms(service: Serving, _: Viewer) -> list[answers.ArmLine]:
 
 @router.post("/arms", status_code=201, responses=failures(409))
 def add_arm(service: Serving, who: Operator, body: NewArm) -> answers.AddedArmAnswer:
-    """Add an arm by its description; sending the same one again changes nothing.
+    """Add an arm by its description; another one of its name is refused unless `replace`, the same one changes nothing.
 
     It may be one that can be identified and not moved; `objections` say why it cannot.
     """
@@ -288,7 +288,7 @@ def delete_motion(
 
 @router.delete("/arms/{arm}", responses=failures(404, 409))
 def delete_arm(service: Serving, who: Operator, arm: ArmName, anyway: answers.Anyway = False) -> answers.DeletionAnswer:
-    """Delete an uploaded arm, with `anyway` all its motions, runs, schedules and acceptances too."""
+    """Delete an uploaded arm; one with motions, runs, schedules or acceptances only with `anyway`, these with it."""
     return answers.deletion_answer(arm, deletion.delete_arm(service.db, service.state, arm, who.name, anyway=anyway))
 
 

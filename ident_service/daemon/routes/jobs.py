@@ -203,13 +203,13 @@ async def renew_lease(service: Serving, who: LeaseKeeper, job: Id) -> answers.Le
 
 @router.post("/stop")
 async def stop_all(service: Serving, who: Near) -> answers.StopAnswer:
-    """Stop all arms, under control, without waiting; needs no role, on the service's own machine no token."""
+    """Stop all arms, under control, without waiting; by any token, or by none where the service listens at loopback."""
     return await _stop(service, None, who)
 
 
 @router.post("/arms/{arm}/stop")
 async def stop_arm(service: Serving, who: Near, arm: ArmName) -> answers.StopAnswer:
-    """Stop one arm, under control; whoever may stop all may stop one. 404 for an unknown arm, none for one at rest."""
+    """Stop one arm, under control, for whoever may stop all; 404 for an unknown arm, no error for one at rest."""
     return await _stop(service, arm, who)
 
 

@@ -217,7 +217,7 @@ def add_maintenance(service: Serving, who: Operator, arm: ArmName, body: Event) 
 
 @router.get("/due")
 def list_due(service: Serving, _: Viewer, arm: ArmName | None = None) -> list[DueAnswer]:
-    """List re-identifications that are due, the earliest first; one that comes to a verdict ends them."""
+    """List re-identifications that are due and neither dismissed nor done since, the earliest first."""
     return [DueAnswer(**row) for row in planned.pending_with_accepted(service.db, service.state, arm)]
 
 
@@ -238,7 +238,7 @@ def list_reidentifications(
 
 @router.post("/reidentifications", status_code=201)
 def begin_reidentification(service: Serving, who: Operator, body: NewReidentification) -> ReidentificationAnswer:
-    """Begin to re-identify an arm: preflight, run, identify, compare with the accepted set.
+    """Begin to re-identify an arm, confirmed as a motion is: preflight, run, identify, compare with the accepted set.
 
     The lease is renewed until the arm has come to rest.
     """
@@ -257,7 +257,7 @@ def get_reidentification(service: Serving, _: Viewer, name: Id) -> Reidentificat
 
 @router.post("/reidentifications/{name}/lease")
 async def renew_reidentification(service: Serving, who: LeaseKeeper, name: Id) -> LeaseAnswer:
-    """Renew the lease of a re-identification, for the step that it is at; none is needed where nothing moves."""
+    """Renew the lease of a re-identification's present step; answer alike where that does not move and has none."""
     step = service.scheduler.reidentifications.step(name)
     if step is None:
         row = await run_in_threadpool(known_reidentification, service.db, name)

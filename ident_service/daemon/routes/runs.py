@@ -120,7 +120,7 @@ def label_run(service: Serving, who: Operator, run: Id, body: Labels) -> answers
 
 @router.get("/runs/{run}/series", response_model=answers.SeriesAnswer)
 def get_series(service: Serving, _: Viewer, request: Request, run: Id, name: FileName | None = None) -> Response:
-    """Show the recording of a run, thinned for display."""
+    """Show a recording of a run, thinned for display: the named one, by default its only one or `run.mcap`."""
     chosen = name or runs.recording_name(service.db, run)
     path = runs.run_file(service.db, service.state, run, chosen)
     sha256 = runs.run_files(service.db, service.state, run)[chosen]

@@ -75,7 +75,7 @@ def get_upload(service: Serving, _: Viewer, upload: Id) -> UploadAnswer:
 
 @router.patch("/uploads/{upload}", responses=failures(404, 409), openapi_extra=_PIECE)
 async def add_piece(request: Request, service: Serving, _: Operator, upload: Id, upload_offset: Offset) -> UploadAnswer:
-    """Send the next piece of a recording, 8 MiB at most; what has come of a torn piece stays, of a refused one not."""
+    """Send the next piece of a recording, 8 MiB at most; what came of a broken-off one stays, of a refused one not."""
     with await run_in_threadpool(uploads.Piece, service.state, upload, upload_offset) as piece:
         try:
             async for data in request.stream():

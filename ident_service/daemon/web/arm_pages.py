@@ -286,7 +286,7 @@ _KINDS: Final = frozenset({"design", "identify", "simulate", "report", "export",
 
 @router.get("/")
 def list_arms(service: Serving, who: Viewer) -> Response:
-    """List all arms: those that something was done with, and the shipped examples."""
+    """Show all arms: those that were uploaded or used, the other shipped ones, and what runs, is due or has drifted."""
     db = service.db
     accepted = {
         row["arm"]: row["number"] for row in db.rows("SELECT arm, MAX(number) AS number FROM acceptances GROUP BY arm")
@@ -441,7 +441,7 @@ def acknowledge(service: Serving, who: Operator, arm: ArmName, form: Form) -> Re
 
 @router.post("/arms/{arm}/accept")
 def accept(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
-    """Accept the parameters of a run as the arm's, on a person's decision."""
+    """Accept the parameters of a run as the arm's, if the form has the arm's name, typed by a person."""
     _require_name(arm, form)
     arms.accept_run(service, who, arm, arms.Acceptance(run=form.get("run", ""), note=form.get("note", "")))
     return see_other(f"/arms/{arm}#accepted")
@@ -449,7 +449,7 @@ def accept(service: Serving, who: Operator, arm: ArmName, form: Form) -> Respons
 
 @router.post("/arms/{arm}/rollback")
 def roll_back(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
-    """Return to an earlier accepted set, on a person's decision."""
+    """Return to an earlier accepted set, if the form has the arm's name, typed by a person."""
     _require_name(arm, form)
     body = {"note": form.get("note", ""), **({"to": form["to"]} if form.get("to") else {})}
     arms.roll_back(service, who, arm, arms.Rollback.model_validate(body))
@@ -458,7 +458,7 @@ def roll_back(service: Serving, who: Operator, arm: ArmName, form: Form) -> Resp
 
 @router.post("/arms/{arm}/pause")
 def pause(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
-    """Pause the motion of an arm, or resume it."""
+    """Pause the motion of an arm or, unless the form's `wanted` is `pause`, resume it; go back to the page."""
     (arms.pause if form.get("wanted") == "pause" else arms.resume)(service, who, arm)
     return _back(service, arm, form)
 
@@ -472,7 +472,7 @@ def finish(service: Serving, who: Operator, arm: ArmName, form: Form) -> Respons
 
 @router.post("/arms/{arm}/supported")
 def supported(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
-    """Confirm, on a person's word, that an arm that is held is supported."""
+    """Confirm that an arm that is held is supported, if the form has the arm's name, typed by a person."""
     arms.supported(service, who, arm, arms.Support(confirm=form.get("name", "").strip()))
     return _back(service, arm, form)
 

@@ -26,7 +26,7 @@ _MOST_FIELDS = 64
 
 
 async def form_of(request: Request) -> dict[str, str]:
-    """Return the fields of a form, the last of each name; its size is bounded by the middleware.
+    """Return the fields of a form, the last of each name; raise 403 without an Origin header, 400 if it is no form.
 
     Raises:
         HTTPException: 403 where it does not say which page it comes from, 400 where it is none.
@@ -48,7 +48,7 @@ class PageRoute(APIRoute):
     """Route whose failures are pages; a caller who is not logged in is sent to the login page."""
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
-        """Return the handler, wrapped so that its errors become pages."""
+        """Return the handler, wrapped so that its errors become pages, and a 401 a redirect to the login page."""
         handler = super().get_route_handler()
 
         async def handle(request: Request) -> Response:

@@ -53,7 +53,7 @@ def add_schedule(service: Serving, who: Operator, arm: ArmName, form: Form) -> R
 
 @router.post("/schedules/{number}/enabled")
 def enable_schedule(service: Serving, who: Operator, number: Number, form: Form) -> Response:
-    """Enable a schedule from now on, or disable it."""
+    """Enable a schedule from now on if the form's `wanted` is `enable`, else disable it."""
     wanted = maintenance.Enabled(enabled=form.get("wanted") == "enable")
     row = maintenance.enable_schedule(service, who, number, wanted)
     return see_other(f"/arms/{row.arm}/maintenance#schedules")

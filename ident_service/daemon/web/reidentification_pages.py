@@ -87,7 +87,7 @@ class Compared:
 
 
 def steps(db: Database, row: Row) -> tuple[Step, ...]:
-    """Return the steps of a re-identification in order, each done, busy, ended or open, with its job.
+    """Return the steps of a re-identification in order, with jobs: each done, busy, open, or ended without a verdict.
 
     Args:
         db: the registry.

@@ -223,7 +223,7 @@ def list_runs(
     parameter: Annotated[list[str] | None, Query(max_length=8)] = None,
     before: BeforeId = None,
 ) -> Response:
-    """Show a page of the table of runs, the newest first, of those that arm, kind, tag and text choose."""
+    """Show a page of the table of runs, the newest first, filtered by arm, kind, tag and text."""
     labels = known.run_labels(service.db)
     shown, earlier = list[dict[str, Any]](), before
     while len(shown) < _RUNS:
@@ -350,7 +350,7 @@ def trend(service: Serving, who: Viewer, arm: ArmName) -> Response:
 
 
 def trends(sets: list[tuple[Row, IdentifiedSet]], reference: str | None) -> list[dict[str, Any]]:
-    """Return a row per base parameter of the newest set, with its change since the accepted set; largest change first.
+    """Return a row per base parameter of the newest set with its change since the accepted set, most significant first.
 
     Args:
         sets: rows of runs and their parameters, the earliest first.

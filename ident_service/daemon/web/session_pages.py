@@ -63,7 +63,7 @@ def show_api() -> Response:
 
 @router.get("/static/{version}/{name}")
 def load(version: str, name: str) -> Response:
-    """Return a style sheet or script."""
+    """Return a style sheet or script, for browsers to keep; 404 unless the address has the present version."""
     if (version, name) == (viewer_version(), VIEWER):
         return Response(viewer_file(), media_type="text/javascript", headers=_KEPT)
     kind = {**STATIC, **VENDORED}.get(name)
