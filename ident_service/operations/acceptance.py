@@ -71,9 +71,11 @@ def accept(db: Database, state: Path, folder: Path, note: str, who: str, *, arm:
 
     Raises:
         UsageError: no note, no name, nothing was identified in the folder, or it is about another arm.
-        MustNotBeUsed: no body can have its parameters, or its file says that they must not be used.
+        MustNotBeUsed: its file does not prove, for the arm's conditions, that a body can have these parameters; or says
+            that they must not be used.
         ParameterError: the folder is not what its manifest names.
     """
+    from ident_service.operations.verify import verify_file
     from ident_service.results.assessment import forbidden_because
     from ident_service.results.run_folder import read_results
 
@@ -84,6 +86,8 @@ def accept(db: Database, state: Path, folder: Path, note: str, who: str, *, arm:
     if forbidden := forbidden_because(results.parameters.content):
         reasons = "; ".join(reason.rstrip(".") for reason in forbidden)
         raise MustNotBeUsed(f"{folder}: must not be used: {reasons}; identify again and accept that")
+    if (proof := verify_file(folder, str(folder / ARM))).verdict != "feasible":
+        raise MustNotBeUsed(f"{folder}: proves no feasible parameters ({proof.message}); see `ident verify {folder}`")
     if arm not in (None, results.config.name):
         raise UsageError(f"{folder.name} is about the arm {results.config.name}, not {arm}")
     arm = results.config.name
