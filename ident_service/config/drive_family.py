@@ -115,7 +115,7 @@ class TorqueLimit(Section):
     below: Annotated[int, Field(strict=True, ge=1)] | None = None
 
     def held(self, counts: int) -> int:
-        """Return `below` (if set) minus a limit [counts], at least 0, else the limit: from limit to entry, or back."""
+        """Return the entry's number for a limit, or back [counts]: `below` minus it, at least 0; itself without `below`."""
         return counts if self.below is None else max(self.below - counts, 0)
 
 

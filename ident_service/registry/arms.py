@@ -187,7 +187,7 @@ def drawn_meshes(state: Path, config: ArmConfig) -> dict[str, Any]:
 
 
 def mesh_file(state: Path, arm: str, sha256: str, joint: int) -> bytes:
-    """Return the triangles that stand still in a joint's frame [m]: nine 32-bit floats each, little-endian.
+    """Return the meshes of a joint's link as triangles in its frame [m]: nine little-endian 32-bit floats each.
 
     Args:
         state: the state folder.

@@ -34,7 +34,7 @@ _RECORDING = ".mcap"
 
 
 def index_run(db: Database, state: Path, run: str) -> Row:
-    """Enter a run's folder, recordings and parameters, checked by a manifest if any, in the registry; return the row.
+    """Enter a run with its recordings and parameters, or renew it; return its row; raises where a file was altered.
 
     Raises:
         UsageError: no such folder, or no arm in it.
