@@ -237,7 +237,7 @@ class Pdos:
             self._node.stop(name)
 
     def receive(self, identifier: int, data: bytes) -> bool:
-        """Process a frame with the identifier of an RPDO; return whether more has changed than what waits for SYNC."""
+        """Process an RPDO's frame; return False where PDOs are stopped or its data only wait for SYNC, else True."""
         changed = bool(self._emergency.active)
         if not self._active:
             return False
