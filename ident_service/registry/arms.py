@@ -51,7 +51,7 @@ class KnownArm:
 
 
 def resources(config: ArmConfig) -> tuple[str, ...]:
-    """Return the names of what a motion of this arm needs for itself: the arm, and each bus that processes share."""
+    """Return the names of what a motion takes for itself: the arm, and its `driver.buses` but those in lock step."""
     buses = getattr(config.driver, "buses", ())
     # A bus in lock step is not shared: it is within one process.
     wires = {f"bus {bus.interface} {bus.channel}" for bus in buses if bus.interface != "lock_step"}
