@@ -355,7 +355,7 @@ class PowerStage:
             self.state = PowerState.FAULT
 
     def supply(self, on: bool) -> None:
-        """Switch the power stage's supply on or off; without it the motor is off and no state with power stays."""
+        """Switch the power stage's supply on or off; without it the motor is off and powered states end."""
         self.voltage = on
         if not on:
             self._motor.switch_off(self._node.now_ns)
