@@ -209,7 +209,7 @@ class Drives:
         return None
 
     def latch(self, torque: Vector | None, faults: Sequence[Fault]) -> Vector:
-        """Queue the demanded torque and begin a period; return the torque that acts in it, after the delay.
+        """Queue a torque (None: the last one again) and begin a period; return the torque acting in it after the delay.
 
         Args:
             torque: demanded torque [N m or N], shape (joints,); None asks for the last one again, and is no torque

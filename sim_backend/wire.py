@@ -158,7 +158,7 @@ class MalformedFrame(DriverError):
 
 
 def encode(frame: Request | Reply, number: int, joints: int) -> bytes:
-    """Encode a request or a reply as bytes, with its number.
+    """Encode a request or a reply as bytes, with the low 32 bits of its number.
 
     Args:
         frame: frame with arrays of shape (joints,).

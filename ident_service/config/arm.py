@@ -598,7 +598,7 @@ class ArmConfig(ExtendedSection):
 
     @property
     def motion_sha256(self) -> str:
-        """Return the SHA-256 of what a motion's safety depends on: mechanism, limits, prior, control, surroundings.
+        """Return the SHA-256 of mechanism, limits, prior, payload, control, surroundings and supply, not the driver.
 
         Other estimators, recording formats, motions or drivers leave it as it is.
         """

@@ -333,7 +333,7 @@ class CanopenDriver(ExtendedSection):
 
     @property
     def torque_reports(self) -> Literal["cyclic", "status", "none"]:
-        """Return how drives report measured torque: every cycle, with the status, or not; as described or by EDS."""
+        """Return how measured torque is reported: as described, else `cyclic` for streamed positions, else by EDS."""
         if self.measured_torque is not None:
             return self.measured_torque
         if self.streams == "position":

@@ -47,7 +47,7 @@ class Realtime(Section):
 
 
 def disagreements(control: Control, joints: Sequence[str]) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Yield (key path, message) where `velocity_cutoff` has not one value per joint.
+    """Yield (key path, message) where `velocity_cutoff` is a list, and not of one value per joint.
 
     Args:
         control: the section `control`.

@@ -115,7 +115,7 @@ class TorqueLimit(Section):
     below: Annotated[int, Field(strict=True, ge=1)] | None = None
 
     def held(self, counts: int) -> int:
-        """Return `below` (if set) minus a limit [counts], at least 0, else the limit: from limit to entry, or back."""
+        """Return the entry's number for a limit [counts], or back: the same, or `below` less it if set, at least 0."""
         return counts if self.below is None else max(self.below - counts, 0)
 
 

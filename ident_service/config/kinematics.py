@@ -47,7 +47,7 @@ def snap_angles(urdf: str) -> str:
 
 
 def angles_barely_rounded(angles: Iterable[float]) -> bool:
-    """Return whether some angle [rad] is a rounded multiple of 15 degrees, and all near multiples are within 1e-5 rad.
+    """Return whether angles [rad] near a multiple of 15 degrees are within 1e-5 of it, and one or more is not exact.
 
     So 1.5708 is a rounded pi/2, and a calibrated 1.5703 beside it shows that nothing is to be taken as exact.
     """

@@ -75,7 +75,7 @@ def load_arm(arm: str | Path, *, upload: bool = False) -> ArmConfig:
 
 
 def with_sheets(config: ArmConfig, files: Sequence[str]) -> ArmConfig:
-    """Return the description whose emulated CANopen drives have these EDS files; raises UsageError for other drives.
+    """Return a copy that gives CANopen drives these EDS files when emulated; raises UsageError for another driver.
 
     Args:
         config: of the arm.

@@ -208,7 +208,7 @@ class Design(Section):
 
 
 def design_disagreements(design: Design, joints: Sequence[str]) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Yield (key path, message) where `design.position_margin` has not one value per joint.
+    """Yield (key path, message) where `design.position_margin` is a list, and not of one value per joint.
 
     Args:
         design: the section `design`.

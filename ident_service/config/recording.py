@@ -331,7 +331,7 @@ def _joints(columns: Mapping[str, Column]) -> int:
 
 
 def mismatched_units(form: RecordingFormat, joints: Sequence[str], revolute: Sequence[bool]) -> Iterator[str]:
-    """Yield a message for each column in a prismatic joint's unit where the joint is revolute, or vice versa.
+    """Yield a message for each joint-side column whose unit is a prismatic joint's, for a revolute one, or vice versa.
 
     Quantities measured at a motor are rotary whatever the joint is, and are not checked.
 

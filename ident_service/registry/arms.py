@@ -51,7 +51,7 @@ class KnownArm:
 
 
 def resources(config: ArmConfig) -> tuple[str, ...]:
-    """Return the names of what a motion of this arm needs for itself: the arm, and each bus that processes share."""
+    """Return the names of what a motion takes for itself: the arm, and its `driver.buses` but those in lock step."""
     buses = getattr(config.driver, "buses", ())
     # A bus in lock step is not shared: it is within one process.
     wires = {f"bus {bus.interface} {bus.channel}" for bus in buses if bus.interface != "lock_step"}
@@ -187,7 +187,7 @@ def drawn_meshes(state: Path, config: ArmConfig) -> dict[str, Any]:
 
 
 def mesh_file(state: Path, arm: str, sha256: str, joint: int) -> bytes:
-    """Return the triangles that stand still in a joint's frame [m]: nine 32-bit floats each, little-endian.
+    """Return the meshes of a joint's link as triangles in its frame [m]: nine little-endian 32-bit floats each.
 
     Args:
         state: the state folder.

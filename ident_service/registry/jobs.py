@@ -107,7 +107,7 @@ def made_nothing(db: Database, job: str) -> None:
 
 
 def explain(db: Database, job: str, detail: str) -> None:
-    """Replace the detail of a job that has ended."""
+    """Replace the `detail` of a job, such as of one that has ended; its state is not looked at."""
     db.write("UPDATE jobs SET detail = ? WHERE id = ?", detail, job)
 
 
@@ -146,7 +146,7 @@ def job_of_key(db: Database, who: str, key: str, request: str) -> Row | None:
 
 
 def typical_seconds(db: Database, kind: str, arm: str | None) -> float | None:
-    """Return the median duration of the last nine completed jobs of a kind and arm [s]; None before any."""
+    """Return the median duration of the last nine done or refused jobs of a kind and arm [s]; None before any."""
     rows = db.rows(
         "SELECT ended - started AS seconds FROM jobs WHERE kind = ? AND arm IS ? AND state IN ('done', 'refused') "
         "AND started IS NOT NULL ORDER BY number DESC LIMIT 9",

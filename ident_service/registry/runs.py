@@ -34,7 +34,7 @@ _RECORDING = ".mcap"
 
 
 def index_run(db: Database, state: Path, run: str) -> Row:
-    """Enter a run's folder, recordings and parameters, checked by a manifest if any, in the registry; return the row.
+    """Enter a run with its recordings and parameters, or renew it; return its row; raises where a file was altered.
 
     Raises:
         UsageError: no such folder, or no arm in it.
@@ -83,7 +83,7 @@ def index_run(db: Database, state: Path, run: str) -> Row:
 
 
 def rebuild_runs(db: Database, state: Path) -> list[str]:
-    """Enter every run folder that the registry does not know; return the folders that cannot be read, and why."""
+    """Enter run folders that the registry does not know, but of running jobs; return `NAME: why` of unreadable ones."""
     known = {row["id"] for row in db.rows("SELECT id FROM runs")}
     busy = {row["run"] for row in db.rows("SELECT run FROM jobs WHERE state = 'running' AND run IS NOT NULL")}
     unreadable = []

@@ -71,7 +71,7 @@ def access_refusal(state: Path, *, writing: bool = False) -> str | None:
 
 
 def give_to_owner(state: Path, path: Path) -> None:
-    """Give what root has made in another user's state folder to that user; do nothing unless called by root.
+    """Give `path`, and the folders down to it, to the owner of the state folder; do nothing unless called by root.
 
     Args:
         state: the state folder.

@@ -111,7 +111,7 @@ class PositionLoop:
         self._integral, self._last_ns = 0.0, 0
 
     def release(self) -> None:
-        """Open the position loop; it starts again from where the motor is then."""
+        """End the position loop; when `torque` is called again, it begins from where the motor is then."""
         self._line, self._integral = None, 0.0
 
     def torque(self, now_ns: int, most: float) -> float:
@@ -340,7 +340,7 @@ class PowerStage:
             self._to(target)
 
     def trip(self, *, coasting: bool = False) -> None:
-        """Enter the fault states (transitions 13, 14) by option 605Eh, unless the power stage failed (`coasting`)."""
+        """Enter a fault state: after braking if the motor is driven, at once when `coasting` or by option 605Eh = 0."""
         if self.state in (*_FAULTS, PowerState.NOT_READY):
             return
         if coasting or self._node.objects.number(0x605E) == 0:
@@ -355,7 +355,7 @@ class PowerStage:
             self.state = PowerState.FAULT
 
     def supply(self, on: bool) -> None:
-        """Switch the supply of the power stage on or off, from outside the drive."""
+        """Switch the power stage's supply on or off; without it the motor is off and powered states end."""
         self.voltage = on
         if not on:
             self._motor.switch_off(self._node.now_ns)
@@ -638,7 +638,7 @@ class CanopenDrive:
         return self._finish()
 
     def evaluate(self, now_ns: int) -> None:
-        """Evaluate position, speed and torque again, after a defect has changed."""
+        """Evaluate position, speed and torque again after a defect has changed, if operation is enabled."""
         self.watch(now_ns)
 
     # Called by the parts of the drive.

@@ -237,7 +237,7 @@ class Pdos:
             self._node.stop(name)
 
     def receive(self, identifier: int, data: bytes) -> bool:
-        """Process a frame with the identifier of an RPDO; return whether more has changed than what waits for SYNC."""
+        """Process an RPDO's frame; return whether more may have changed at once than its data, which wait for SYNC."""
         changed = bool(self._emergency.active)
         if not self._active:
             return False

@@ -103,7 +103,7 @@ _SHIPPED = {1: 0, 2: 1}  # vendor and product that `configs/emulated_drive.eds` 
 
 
 def described_personality(text: str, drive: CanopenDrive, families: Sequence[Family] = ()) -> DriveProperties:
-    """Return `LIKE_NEW` for the shipped data sheet, else the properties that `personality_of` derives."""
+    """Return `LIKE_NEW` if the EDS has the identity of the shipped drive, else the properties by `personality_of`."""
     told = data_sheet(text).identity
     shipped = all(told.get(sub) == value for sub, value in _SHIPPED.items())
     return LIKE_NEW if shipped else personality_of(text, drive, families)

@@ -168,7 +168,7 @@ class Body:
         return self._speeds[motor]
 
     def changes(self, now_ns: int) -> None:
-        """Advance the plant to a time at which a motor or a load changes: the old state acts until then."""
+        """Advance the plant, as `advance`, before a motor or a load changes now: the old state acts until then."""
         self.advance(now_ns)
 
     def advance(self, now_ns: int) -> None:

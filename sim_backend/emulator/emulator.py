@@ -97,7 +97,7 @@ class Emulator:
 
     @property
     def next_deadline_ns(self) -> int | None:
-        """Return when `tick` has something to do [ns], a drive's timer or a fault; None for never."""
+        """Return when `tick` is next due [ns]: for a timer, a fault or the plant in motion; None for never."""
         if self._deadline is not None:
             return self._deadline[0]
         times = [begin for begin, _, _ in self._to_begin] + [end for end, _ in self._to_end]

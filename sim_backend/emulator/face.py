@@ -62,7 +62,7 @@ class EmulatedDevice(BusDevice, Protocol):
 
     @property
     def released(self) -> bool:
-        """Return whether a host has led the drive, has switched it off and has left, all in order."""
+        """Return whether the drive is off by its host's last command, not by a fault; pucks are so from power-up on."""
 
     @property
     def sync_identifier(self) -> int:

@@ -152,7 +152,7 @@ class Motor:
         self._do(self._unpowered, 0.0, now_ns)
 
     def hold(self, now_ns: int) -> None:
-        """Hold the shaft by the drive's own loop, which creeps no more than a closed brake."""
+        """Hold the shaft by the drive's own loop, simulated as firm as a closed brake."""
         self._do(Power.HELD, 0.0, now_ns)
 
     def fail(self, now_ns: int) -> None:

@@ -194,7 +194,7 @@ class EmulatedPuck:
         """Do nothing: a puck limits torque by its counts alone."""
 
     def fail(self, code: int, now_ns: int, *, lasting: bool = False) -> list[Frame]:
-        """Enter an error, STAT 1 without torque, not to be cleared while it lasts; return no frames."""
+        """Enter an error (STAT 1, no torque), which a host may clear, a `lasting` one after `repaired`; return []."""
         self._stat, self._mode, self._told = Status.ERROR, Mode.IDLE, 0
         self.values["ERROR"] = code & 0x7FFF
         self._lasting = self._lasting or lasting

@@ -109,7 +109,7 @@ class EmulatedSafetyPuck:
 
     @property
     def next_deadline_ns(self) -> int | None:
-        """Return when the heartbeat is overdue, a person presses a key, or frames wait [ns]; None for never."""
+        """Return when `tick` is next due [ns]: heartbeat, overspeed, a key press or waiting frames; None for never."""
         due = [self._now_ns] if self._out else []
         if self.mode is SafetyMode.ACTIVE and self._traffic_ns is not None and not self.ignores_heartbeat:
             due.append(self._traffic_ns + self._heartbeat_ns)
@@ -166,7 +166,7 @@ class EmulatedSafetyPuck:
         return self._taken()
 
     def press(self, key: str, now_ns: int) -> None:
-        """Press a pendant key: `idle` clears faults, `activate` acts in IDLE without any; no key in an e-stop."""
+        """Press a pendant key: `idle` clears faults, `activate` needs IDLE and no fault; neither works in an e-stop."""
         self._now_ns = now_ns
         if self._pressed:
             return
@@ -180,7 +180,7 @@ class EmulatedSafetyPuck:
             self._enter(SafetyMode.ACTIVE, now_ns)
 
     def emergency_stop(self, pressed: bool, now_ns: int) -> None:
-        """Press or release the button that takes the motors' power; released, the arm is idle after Shift-Idle."""
+        """Press or release the emergency stop; once released, the mode ESTOP lasts until the key `idle` is pressed."""
         self._now_ns = now_ns
         if pressed and not self._pressed:
             self._fault("e-stop", now_ns)
