@@ -131,7 +131,7 @@ def _drives(model: ArmModel, delta: Array) -> Array:
 
 
 def lines_of(model: ArmModel, link: int) -> Sequence[Capsule]:
-    """Return capsules (rods) from a link's joint to the joints that it carries, in the link's frame.
+    """Return capsules (rods) from a link's joint to the joints that it carries, else to its frame; in the link's frame.
 
     Args:
         model: of the arm.
