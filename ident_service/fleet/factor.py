@@ -243,7 +243,7 @@ class Described:
 
     @property
     def base(self) -> BaseParameters:
-        """Return the base parameters of the arm."""
+        """Return which base parameters the arm has, without values."""
         return _model(self.description)[1]
 
     @property

@@ -55,7 +55,7 @@ class Scene:
 
 
 def link_bodies(model: ArmModel) -> list[Body]:
-    """Return the solids of base and links: those described under `geometry`; for other links, those of the URDF.
+    """Return the solids of base and links: those described under `geometry`, else the URDF's; ModelError for a mesh there.
 
     Raises:
         ModelError: a link that does not exist, or a mesh where capsules are needed.
