@@ -35,7 +35,7 @@ class ArmModel:
     prior: Array | None
 
     def with_options(self, options: Identification | None = None, **changes: Any) -> ArmModel:
-        """Return a copy with these `options` of identification (None: its own), in which the keywords are changed."""
+        """Return a copy with these identification `options` (None: its own), the given keys replaced in them."""
         options = (options or self.config.identification).model_copy(update=changes)
         return replace(self, config=self.config.model_copy(update={"identification": options}))
 

@@ -55,7 +55,7 @@ class Scene:
 
 
 def link_bodies(model: ArmModel) -> list[Body]:
-    """Return the solids of base and links: those described under `geometry`, else the URDF's; ModelError for a mesh there.
+    """Return the solids of base and links: those under `geometry`, else the URDF's, with ModelError for a mesh.
 
     Raises:
         ModelError: a link that does not exist, or a mesh where capsules are needed.

@@ -97,7 +97,7 @@ def likely_load(mass: float, center: Array) -> Array:
 
 
 def with_file_bodies(model: ArmModel) -> ArmModel:
-    """Return the model with the bodies of its URDF or MJCF, real or not, as its whole prior; unchanged for a DH table."""
+    """Return the model whose prior is its URDF's or MJCF's bodies alone, real or not; unchanged for a DH table."""
     kinematics = model.config.kinematics
     file = kinematics.urdf or kinematics.mjcf
     if file is None:

@@ -67,7 +67,7 @@ class RangeRecording:
         self.payload = payload_of(self.whole)
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
-        """Yield the samples in the range, in blocks; RecordingError where it has none, or ends beyond the recording.
+        """Yield the samples in the range, in blocks; RecordingError if there are none, or its end is beyond the file's.
 
         Raises:
             RecordingError: no sample lies in the range; and whatever the whole recording's blocks raise.

@@ -110,7 +110,7 @@ class RingSink:
         return self._gone
 
     def put(self, cycle: Cycle) -> bool:
-        """Put one cycle into the ring; return False if the recorder falls behind, in lock step wait and return True.
+        """Put one cycle into the ring, then return whether the recorder keeps up; in lock step wait until it does.
 
         The cycle's arrays are copied. Out of lock step this never waits.
 
@@ -127,7 +127,7 @@ class RingSink:
         return self._wait() if self._lock_step else self._keeps_up()
 
     def event(self, stamp_ns: int, level: int, message: str) -> bool:
-        """Put one event into the ring; return False if the recorder falls behind, in lock step wait and return True."""
+        """Put one event into the ring, then return whether the recorder keeps up; in lock step wait until it does."""
         try:
             self.writer.event(stamp_ns, level, message)
         except struct.error as error:
