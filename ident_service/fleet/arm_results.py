@@ -182,7 +182,7 @@ class ArmFits:
 def arm_fits(
     leaves: Leaves, described: Described, store: Store, between: Array, trained: _Given = None, held: _Given = None
 ) -> ArmFits | tuple[str, ...]:
-    """Fit an arm to all its recordings, to those not held out, and to one; or return the keys of missing factors.
+    """Fit an arm to all its recordings, to those not held out, and to the first; or return the keys of missing factors.
 
     Args:
         leaves: factors of the arm.

@@ -243,7 +243,7 @@ class Described:
 
     @property
     def base(self) -> BaseParameters:
-        """Return the base parameters of the arm."""
+        """Return which base parameters the arm has, without values."""
         return _model(self.description)[1]
 
     @property
@@ -398,19 +398,21 @@ def settle(sources: Sequence[Source], description: str) -> Settled | tuple[Probl
 
 @trimmed
 @one_blas_thread()
-def reduce_recording(part: Part, described: Described, store: Store, version: str, again: bool = False) -> Outcome:
+def reduce_recording(
+    part: Part, described: Described, store: Store, client_version: str, again: bool = False
+) -> Outcome:
     """Reduce a recording or piece to factor and row in the store, unless there; return row or what is wrong with it.
 
     Args:
         part: to reduce.
         described: the arm, with numbers for all that could be chosen.
         store: of the factors.
-        version: version of the client's package.
+        client_version: version of the client's package.
         again: whether to compute it although it is there.
     """
     source = part.source
-    if version != __version__:
-        text = f"this worker has ident-service {__version__}, the client {version}; install the same"
+    if client_version != __version__:
+        text = f"this worker has ident-service {__version__}, the client {client_version}; install the same"
         return Outcome(part, None, Problem(source.url, part.label, "version", text))
     seen = described.seen(part)
     noted = None if again else store.read(seen)
@@ -577,10 +579,10 @@ def packed(merged: Merged) -> bytes:
 
 
 def unpacked(content: bytes, described: Described) -> Merged:
-    """Read a factor from the bytes of an npz file; raises ValueError if it is damaged or of another arm.
+    """Read a factor from the bytes of an npz file; raises ValueError if it is damaged or its sizes are not the arm's.
 
     Raises:
-        ValueError: it is damaged, or of another arm.
+        ValueError: it is damaged, or its sizes are not the arm's.
     """
     base = described.base
     supports = sparsity(described.model.chain, described.model.layout, base.base)

@@ -105,7 +105,7 @@ class ArmFit:
         return cls(fit, doubt, clusters, precision, total, error)
 
     def weighed(self, between: Array) -> ArmFit:
-        """Return a copy with the precision lowered by the variance between recordings.
+        """Return a copy with its precision lowered by `between`, the variance of the arm's mean between recordings.
 
         Args:
             between: variance of the arm's mean by that [SI^2], shape (base,).

@@ -328,7 +328,7 @@ def reduce_fleet(
     tell: Tell,
     step: Step = lambda words, share: None,
 ) -> Reduced:
-    """Reduce a fleet's recordings on workers to factors and rows in the store; return the rows by arm, and problems.
+    """Settle the description, and reduce recordings on workers, into the store; return the rows by arm, and problems.
 
     Args:
         client: of the scheduler.
@@ -485,7 +485,7 @@ def _mapped(
 
 
 def reduce_again(client: Client, reduced: Reduced, keys: Collection[str], store: Store) -> None:
-    """Compute factors that are gone or damaged again from their recordings; raises StorageError where it fails.
+    """Compute lost or damaged factors again on workers; raises StorageError where a recording cannot be used any more.
 
     Args:
         client: of the scheduler.

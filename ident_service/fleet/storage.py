@@ -219,7 +219,7 @@ class Store:
         persistently(put, self._place(name))
 
     def names(self, folder: str) -> Iterator[tuple[str, int]]:
-        """Yield name and size [bytes] of every file in a folder of the store, sorted; none where there is no folder.
+        """Yield bare name and size [bytes] of every file below a folder of the store, sorted; none where it is absent.
 
         Raises:
             StorageError: storage cannot be reached.

@@ -35,17 +35,17 @@ class ArmModel:
     prior: Array | None
 
     def with_options(self, options: Identification | None = None, **changes: Any) -> ArmModel:
-        """Return the arm with other `options` of identification, or with its own, changed by these keys."""
+        """Return a copy with these identification `options` (None: its own), the given keys replaced in them."""
         options = (options or self.config.identification).model_copy(update=changes)
         return replace(self, config=self.config.model_copy(update={"identification": options}))
 
 
-def arm_model(config: ArmConfig, *, bodies: bool = True) -> ArmModel:
+def arm_model(config: ArmConfig, *, require_masses: bool = True) -> ArmModel:
     """Build chain, parameter layout and prior parameters of an arm from its description; raises where they do not fit.
 
     Args:
         config: the description.
-        bodies: whether masses that no link has are refused in a URDF whose bodies are the prior.
+        require_masses: whether a URDF whose bodies are the prior is refused for masses that no link has.
 
     Raises:
         ModelError: a mechanism that is not a tree of one-degree-of-freedom joints, or joints of the configuration
@@ -63,7 +63,7 @@ def arm_model(config: ArmConfig, *, bodies: bool = True) -> ArmModel:
 
         if kinematics.urdf is not None:
             chain, inertias = read_urdf(kinematics.urdf, config.gravity, kinematics)
-            if bodies and config.prior is None:
+            if require_masses and config.prior is None:
                 _require_bodies(config, kinematics.urdf, inertias)
         elif kinematics.mjcf is not None:
             chain, inertias = read_mjcf(kinematics.mjcf, config.gravity, kinematics)

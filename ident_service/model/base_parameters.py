@@ -172,7 +172,7 @@ def grouping(H: Array, names: tuple[str, ...], units: tuple[str, ...]) -> BasePa
 
 
 def remarks_on_angles(base: BaseParameters) -> tuple[str, ...]:
-    """Return a remark where base parameters exist only since angles are rounded (1.5708 for pi/2); else nothing.
+    """Return a remark, in a tuple, if some base parameters can hardly be told apart, as with rounded angles; else ().
 
     Columns of real mechanisms are a third independent of the others, or not at all; 1.5708 for pi/2 leaves a millionth.
     """

@@ -46,7 +46,7 @@ def unit(vectors: Array) -> tuple[Array, Array]:
 def between_segments(
     start: Array, along: Array, other_start: Array, other_along: Array, squares: Array, other_squares: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Return distances [m], directions and nearest points of pairs of segments, also parallel or degenerate.
+    """Return distances [m], directions and nearest places (0 to 1 along) of pairs of segments, also degenerate ones.
 
     After Ericson, Real-Time Collision Detection, 5.1.9.
 
@@ -97,7 +97,7 @@ def to_half_spaces(start: Array, along: Array, normal: Array, offset: Array) -> 
 
 
 def to_boxes(start: Array, along: Array, half: Array) -> tuple[Array, Array, Array]:
-    """Return signed distances [m] of segments to axis-aligned boxes about the origin, gradients and nearest shares.
+    """Return signed distances [m] of segments to boxes about the origin, gradients and nearest places (0 to 1 along).
 
     Outside, half the slope of the squared distance is linear between the places where the line crosses a face's plane.
     Of a line that enters the box the deepest point counts, whose negative distance to the nearest face is convex too.

@@ -55,7 +55,7 @@ class Scene:
 
 
 def link_bodies(model: ArmModel) -> list[Body]:
-    """Return the solids of base and links: those described under `geometry`; for other links, those of the URDF.
+    """Return the solids of base and links: those under `geometry`, else the URDF's, with ModelError for a mesh.
 
     Raises:
         ModelError: a link that does not exist, or a mesh where capsules are needed.
@@ -389,7 +389,7 @@ def kinematics(chain: Chain) -> pin.Model:
 
 
 def lowest_point(model: ArmModel) -> Callable[[Array], float]:
-    """Create a function from a position [rad or m] to the height of the arm's lowest point above the base [m].
+    """Create a function from a position [rad or m] to the height [m] over the base of the lowest capsule or link frame.
 
     Args:
         model: model of the arm, whose links are taken as the capsules of its geometry and the origins of their frames.

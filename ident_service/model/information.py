@@ -45,10 +45,10 @@ class Information:
         return len(self.factors)
 
     def merged(self, other: Information) -> Information:
-        """Return the information of both sets of equations together; raises ModelError for different models.
+        """Return the information of both sets of equations together; raises ModelError if their sizes differ.
 
         Raises:
-            ModelError: the two belong to different models.
+            ModelError: they have other numbers of base parameters or joints.
         """
         self.require_same(other)
         factors = tuple(_stacked(pair) for pair in zip(self.factors, other.factors, strict=True))
@@ -56,10 +56,10 @@ class Information:
 
     @staticmethod
     def sum(parts: Iterable[Information]) -> Information:
-        """Merge any number of sets of equations, at least one, into one; raises ModelError for different models.
+        """Merge any number of sets of equations, at least one, into one; raises ModelError if their sizes differ.
 
         Raises:
-            ModelError: they belong to different models.
+            ModelError: they have other numbers of base parameters or joints.
         """
         every = tuple(parts)
         first = every[0]

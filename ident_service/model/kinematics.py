@@ -25,7 +25,7 @@ def frame_origins(chain: Chain, position: Array) -> Array:
 
 
 def joint_frames(chain: Chain, position: Array) -> tuple[Array, Array]:
-    """Return rotation and origin [m] of every joint frame in the base frame; its link's solids do not move in it.
+    """Return rotation and origin [m] in the base frame of every joint frame, as its joint moves it, at each posture.
 
     Args:
         chain: the mechanism.

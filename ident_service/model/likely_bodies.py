@@ -97,7 +97,7 @@ def likely_load(mass: float, center: Array) -> Array:
 
 
 def with_file_bodies(model: ArmModel) -> ArmModel:
-    """Return the model whose prior is the bodies of its URDF or MJCF, real or not; unchanged for a DH table."""
+    """Return the model whose prior is its URDF's or MJCF's bodies alone, real or not; unchanged for a DH table."""
     kinematics = model.config.kinematics
     file = kinematics.urdf or kinematics.mjcf
     if file is None:
@@ -131,7 +131,7 @@ def _drives(model: ArmModel, delta: Array) -> Array:
 
 
 def lines_of(model: ArmModel, link: int) -> Sequence[Capsule]:
-    """Return capsules (rods) from a link's joint to the joints that it carries, in the link's frame.
+    """Return capsules (rods) from a link's joint to the joints that it carries, else to its frame; in the link's frame.
 
     Args:
         model: of the arm.

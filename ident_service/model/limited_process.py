@@ -29,7 +29,7 @@ def own_module(module: str, *words: str) -> tuple[list[str], dict[str, str]]:
 
 
 def run_limited_process(module: str, path: Path, deadline: float, *more: str) -> dict[str, Any]:
-    """Run a module on a file in a process with limits; return the JSON object that it prints, or raise ModelError.
+    """Run a module on a file in a limited process and return the JSON object it prints; ModelError if it breaks off.
 
     Args:
         module: module whose `main` calls `answer_within`.
@@ -66,7 +66,7 @@ _PR_SET_PDEATHSIG = 1  # of prctl(2)
 
 
 def end_with_input() -> None:
-    """Start a thread that kills this process when its standard input ends; unset the variable that asked for it."""
+    """Start a thread that kills this process when its standard input ends; unset `ENDS_WITH_INPUT`, whatever it is."""
     os.environ.pop(ENDS_WITH_INPUT, None)  # of this command, and not of what it starts
 
     def wait() -> None:

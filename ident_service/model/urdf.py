@@ -167,7 +167,7 @@ def roll_pitch_yaw(rotation: Array) -> Array:
 
 
 def urdf_solids(kinematics: Kinematics, chain: Chain, skip: frozenset[str]) -> list[Body]:
-    """Return the collision solids of a URDF's links of the arm and its base, but those in `skip`; [] without URDF.
+    """Return the collision solids of a URDF's arm and base links not in `skip`; [] without URDF, ModelError for a mesh.
 
     Args:
         kinematics: the URDF that the chain was read from, and which part of it is the arm.

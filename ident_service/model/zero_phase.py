@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 
 def low_pass(values: Array, order: int, cutoff: float, rate: float, pad: int | None = None) -> Array:
-    """Filter every column forwards and backwards with a Butterworth low-pass, so without phase; same shape.
+    """Filter every column both ways with a Butterworth low-pass, so without phase; same shape; ValueError if too short.
 
     Each end is continued by its odd reflection, and the filter begins in the steady state of the first value, as
     Gustafsson (1996) has it for `filtfilt` in general.

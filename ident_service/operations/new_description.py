@@ -301,7 +301,7 @@ def new_description(
 
         def loaded() -> ArmModel:
             trial.write_text(in_yaml(draft), encoding="utf-8")
-            return arm_model(load_arm(trial), bodies=False)  # what is none is guessed
+            return arm_model(load_arm(trial), require_masses=False)  # what is none is guessed
 
         draft.remarks += _part_remark(loaded(), draft)
         _gravity(draft, loaded())

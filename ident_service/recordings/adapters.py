@@ -67,7 +67,7 @@ class RangeRecording:
         self.payload = payload_of(self.whole)
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
-        """Yield the samples in the range, in blocks of `samples` or shorter; raises RecordingError where it has none.
+        """Yield the samples in the range, in blocks; RecordingError if there are none, or its end is beyond the file's.
 
         Raises:
             RecordingError: no sample lies in the range; and whatever the whole recording's blocks raise.
@@ -175,7 +175,7 @@ def without_standstill(recording: Recording, margin: float) -> RangeRecording:
 
 
 def without_ends(recording: Recording, trim: tuple[float, float]) -> RangeRecording:
-    """Return the recording without its first and last seconds; raises RecordingError where nothing is left.
+    """Return the recording without its first `trim[0]` and last `trim[1]` seconds; RecordingError if nothing is left.
 
     Args:
         recording: recording that is read through once.
@@ -296,10 +296,11 @@ class MeasuredRecording:
 
     @torn.setter
     def torn(self, torn: bool) -> None:
+        """Mark the recording that is read from as torn, or not."""
         self.whole.torn = torn
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
-        """Yield blocks whose torque is the one that drives measured; samples without one are left out.
+        """Yield blocks whose torque is the measured one; samples without it are left out; RecordingError if all are.
 
         Raises:
             RecordingError: as the recording's, or no sample has a measured torque.

@@ -72,6 +72,7 @@ class CachedRecording:
 
     @torn.setter
     def torn(self, torn: bool) -> None:
+        """Mark the recording that is read from as torn, or not."""
         self._whole.torn = torn
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:

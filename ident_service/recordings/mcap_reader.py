@@ -148,7 +148,7 @@ class JointStateDecoder:
         self._velocity = velocity
 
     def decode(self, payloads: Sequence[bytes] | NDArray[np.uint8], log_times: Sequence[int] | Stamps) -> Block:
-        """Decode JointState payloads into one block, in order; raises PayloadError whose `index` is that of a bad one.
+        """Decode JointState payloads into one block, in order, but those of foreign joints; PayloadError with `index`.
 
         Args:
             payloads: JointState messages; of those of one length also as rows, shape (messages, bytes).

@@ -186,7 +186,7 @@ def expand(content: bytes) -> bytes:
 
 
 def messages(run: bytes, directory: Directory, choose: Callable[[int], bool] = lambda _: True) -> Iterator[Message]:
-    """Yield channel id, log time [ns] and payload of each message in bytes of records, one by one."""
+    """Yield channel id, log time [ns] and payload of each message of chosen channels in bytes of records."""
     for found in series(run, directory, choose):
         if isinstance(found, Series):
             for stamp, row in zip(found.log_times.tolist(), found.payloads, strict=True):
@@ -198,7 +198,7 @@ def messages(run: bytes, directory: Directory, choose: Callable[[int], bool] = l
 def series(
     run: bytes, directory: Directory, choose: Callable[[int], bool] = lambda _: True
 ) -> Iterator[Message | Series]:
-    """Yield the messages in bytes of records; enter channels and schemas into `directory`.
+    """Yield the messages of chosen channels in bytes of records, like ones as a `Series`; fill in `directory`.
 
     Where records repeat in kind, length and channel, as those of a loop do, all of them are found at once.
 

@@ -171,7 +171,7 @@ class Quality:
 
 
 def quality(recording: Recording, fmt: RecordingFormat, torque_limit: Array | None = None) -> Quality:
-    """Assess a recording's rate, jitter, gaps, saturation and standstill in one more pass of constant memory.
+    """Assess a recording's rate, jitter, gaps, saturation and standstill; reads it twice, in constant memory.
 
     Args:
         recording: recording, which is read once more after `grid`.

@@ -154,7 +154,7 @@ class RecorderProcess:
 
     @property
     def error(self) -> str:
-        """Return why the recording failed; empty as long as it has not."""
+        """Return why the recording failed; empty as long as no failure is known."""
         return self._error if self._sink is None else self._sink.error
 
     @property
@@ -163,11 +163,11 @@ class RecorderProcess:
         return 0 if self._process is None else self._process.pid
 
     def put(self, cycle: Cycle) -> bool:
-        """Put one cycle into the ring; return whether the recorder keeps up, or in lock step wait until it does."""
+        """Put one cycle into the ring, then return whether the recorder keeps up; in lock step wait until it does."""
         return self._open_sink().put(cycle)
 
     def event(self, stamp_ns: int, level: int, message: str) -> bool:
-        """Put one event into the ring; return whether the recorder keeps up, or in lock step wait until it does."""
+        """Put one event into the ring, then return whether the recorder keeps up; in lock step wait until it does."""
         return self._open_sink().event(stamp_ns, level, message)
 
     def close(self, *, complete: bool = True) -> None:

@@ -104,13 +104,13 @@ class RingSink:
 
     @property
     def error(self) -> str:
-        """Return why the recorder takes no more records, in its own words where it left some; empty while it does."""
+        """Return why the recorder takes no more records, as it reported or since it was found dead; else empty."""
         if self._words[at.STATE] == State.FAILED:
             return self.writer.memory.text()
         return self._gone
 
     def put(self, cycle: Cycle) -> bool:
-        """Put one cycle into the ring; return whether the recorder keeps up, or in lock step wait until it does.
+        """Put one cycle into the ring, then return whether the recorder keeps up; in lock step wait until it does.
 
         The cycle's arrays are copied. Out of lock step this never waits.
 
@@ -127,7 +127,7 @@ class RingSink:
         return self._wait() if self._lock_step else self._keeps_up()
 
     def event(self, stamp_ns: int, level: int, message: str) -> bool:
-        """Put one event into the ring; return whether the recorder keeps up, or in lock step wait until it does."""
+        """Put one event into the ring, then return whether the recorder keeps up; in lock step wait until it does."""
         try:
             self.writer.event(stamp_ns, level, message)
         except struct.error as error:

@@ -275,7 +275,7 @@ def report_html(evidence: Evidence, parameters: ParameterFile, config: ArmConfig
     content = parameters.content
     found = assess(content)
     order = [one.place for one in found.joints] or list(range(len(evidence.joints)))
-    drawn = figures(evidence, parameters, arm_model(config, bodies=False).chain)
+    drawn = figures(evidence, parameters, arm_model(config, require_masses=False).chain)
     link_values = content.get("link_parameters", {})
     return render(
         "report.html",
