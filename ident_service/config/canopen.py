@@ -403,7 +403,7 @@ def joint_torques(driver: CanopenDriver, transmission: Transmission) -> list[flo
         driver: the section `driver`, with as many drives as ratios.
         transmission: the arm's.
     """
-    motors = np.array([drive.max_torque for drive in driver.drives])
+    motors = np.array([drive.max_torque * drive.torque_scale for drive in driver.drives])
     # tau_motor = J^-T tau: a joint alone asks each of its motors for a share.
     shares = np.abs(
         np.linalg.inv(np.array(transmission.ratios)[:, None] * transmission.coupling_matrix)
@@ -413,7 +413,9 @@ def joint_torques(driver: CanopenDriver, transmission: Transmission) -> list[flo
 
 
 def motor_torques(driver: CanopenDriver, transmission: Transmission, torques: Sequence[float | None]) -> list[float]:
-    """Return the largest torque of each motor [N m] that keeps all joints within their limits, whatever others give.
+    """Return the largest torque to ask each motor for [N m] that keeps all joints within limits, whatever others give.
+
+    A motor gives `torque_scale` times what it is asked for.
 
     Args:
         driver: the section `driver`, with as many drives as ratios.
@@ -422,12 +424,13 @@ def motor_torques(driver: CanopenDriver, transmission: Transmission, torques: Se
     """
     # (motors, joints): tau = J^T tau_motor
     reach = np.abs(np.array(transmission.ratios)[:, None] * transmission.coupling_matrix)
-    most = np.array([drive.max_torque for drive in driver.drives])
+    asked = np.array([drive.max_torque for drive in driver.drives])
+    given = asked * np.array([drive.torque_scale for drive in driver.drives])
     allowed = np.array([np.inf if one is None else one for one in torques])
     share = np.minimum(
-        allowed / (reach.T @ most), 1.0
+        allowed / (reach.T @ given), 1.0
     )  # of every joint, when all of its motors give all that they have
-    return [float(torque * share[row > 0.0].min()) for torque, row in zip(most, reach, strict=True)]
+    return [float(torque * share[row > 0.0].min()) for torque, row in zip(asked, reach, strict=True)]
 
 
 def quick_stop_decelerations(

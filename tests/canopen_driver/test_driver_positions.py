@@ -96,8 +96,12 @@ def test_positions_are_tracked_until_the_drives_are_enabled_and_held_from_then_o
         np.testing.assert_allclose(sample.position, before, atol=1e-4)
 
 
-def test_the_drive_alone_can_keep_the_joints_torque_limits_so_they_are_written_to_it() -> None:
+@pytest.mark.parametrize("scale", [1.0, 1.5, 0.8])
+def test_the_drive_alone_can_keep_the_joints_torque_limits_so_they_are_written_to_it(scale: float) -> None:
+    """A motor that gives more than it is asked for is asked for less."""
     config = positions_config()
+    drives = [drive.model_copy(update={"torque_scale": scale}) for drive in config.driver.drives]
+    config = config.model_copy(update={"driver": config.driver.model_copy(update={"drives": tuple(drives)})})
     joints = {name: joint.model_copy(update={"torque": 2.0}) for name, joint in config.joints.items()}
     bench = Bench(config.model_copy(update={"joints": joints}), config)
     with bench.arm:
