@@ -263,7 +263,7 @@ def require_near(position: Vector, limits: MotionLimits, names: Sequence[str]) -
 
 
 def relaxed_limits(position: Vector, limits: MotionLimits, share: float = SAG) -> MotionLimits:
-    """Return limits that contain `position`: one that a joint has passed moves to it and `share` of following error on.
+    """Return limits that contain `position`: widened, where it is outside, to `share` of following error beyond it.
 
     Args:
         position: present position of the arm [rad or m], shape (joints,).

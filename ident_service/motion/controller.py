@@ -101,7 +101,7 @@ class ComputedTorque:
         elapsed: float | None = None,
         back: Vector | float = 0.0,
     ) -> Vector:
-        """Update the velocity filter; return a torque that damps, bears a share of gravity and corrects by `back`.
+        """Update the velocity filter; return torque that damps motion, bears `share` of gravity and pulls by `back`.
 
         Args:
             position: as for `torque`.
