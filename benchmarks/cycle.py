@@ -63,7 +63,9 @@ def measure(model: ArmModel) -> list[Row]:
             sample = Sample(cycle, stamp_ns, position, None, torque, valid, age, 0, (1,) * 7)
             start = clock()
             deadlines.cycle(stamp_ns, stamp_ns)
-            usable, _ = guard.feedback(sample, setpoint, control.velocity, control.correction, control.answer)
+            usable, _ = guard.feedback(
+                sample, setpoint, control.velocity, control.correction, control.feedback_acceleration
+            )
             seen = clock()
             wanted = control.torque(position, usable, setpoint)
             law = clock()

@@ -94,7 +94,7 @@ def try_driver(config: ArmConfig, confirm: Callable[[str], str], arm: Arm | None
         arm: the arm, not open; the configured one when None.
 
     Raises:
-        DriverError: nothing is installed that can reach such an arm.
+        UsageError: the description has no driver section, or no driver of its kind is installed.
     """
     arm = make_arm(config) if arm is None else arm
     found = [_tried(arm, words, act) for words, act in _closed()]

@@ -69,7 +69,7 @@ class ClearanceChecker:
         self._limits = limits
 
     def require_clear(self, reference: Reference, limits: MotionLimits) -> Generator[None, None, None]:
-        """Check in slices that a trajectory keeps clear and no stop out of it touches; MotionRefused if not.
+        """Prove in slices that a trajectory keeps the clearance and no sampled stop touches; MotionRefused if it fails.
 
         Where the arm stands nearer to something than the clearance, as after a stop, half of that distance is kept.
 
@@ -115,7 +115,7 @@ class ClearanceChecker:
 def trajectory_stop_contact(
     collision: CollisionModel, reference: Reference, limits: MotionLimits
 ) -> Generator[None, None, str | None]:
-    """Describe in slices the first sampled stop out of a trajectory that touches, by exact shapes; None if none."""
+    """Check sampled stops out of a trajectory by exact shapes, in slices; describe the first that touches, or None."""
     for time in np.arange(0.0, reference.duration, _BEGINS).tolist():
         stopping = stop(reference.at(time), limits)
         yield
@@ -263,7 +263,7 @@ def require_near(position: Vector, limits: MotionLimits, names: Sequence[str]) -
 
 
 def relaxed_limits(position: Vector, limits: MotionLimits, share: float = SAG) -> MotionLimits:
-    """Return limits widened, where a joint stands outside, to its position and `share` of the following error more.
+    """Return limits that contain `position`: widened, where it is outside, to `share` of following error beyond it.
 
     Args:
         position: present position of the arm [rad or m], shape (joints,).

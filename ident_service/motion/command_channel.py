@@ -94,7 +94,7 @@ class Controls(Protocol):
         """Return the stage of leading the held arm home: `NONE`, `ASKED`, then what `tell_homing` has set."""
 
     def tell_homing(self, stage: Homing) -> None:
-        """Set the stage of leading the arm home; while it is `GOING`, `lease_ok` checks the requester of that."""
+        """Set the stage of leading the arm home; while it is `GOING`, `lease_ok` checks who requested the way home."""
 
     def lease_ok(self, now_ns: int) -> bool:
         """Return whether the requester of the motion counts as alive; if not, the loop stops the arm."""
@@ -270,7 +270,7 @@ class ControlFile:
         return self._memory[_FINISH] != 0
 
     def request_finish(self) -> None:
-        """Request that the run end early, where it began; not revocable. A paused arm must be let go on first."""
+        """Request that the run end early by going back to where it began; not revocable; resume a paused arm first."""
         self._memory[_FINISH] = 1
 
     @property
@@ -481,9 +481,9 @@ class SupervisedCommands:
         return bool(self._poll.poll(0))
 
     def lease_ok(self, now_ns: int) -> bool:
-        """Return whether the requester's pipe is open and, in real time, its lease valid; led home, only that lease.
+        """Return whether the requester's pipe is open and its lease valid; while led home, only the home lease counts.
 
-        The motion home of a held arm has another requester, whose lease counts instead.
+        The motion home of a held arm has another requester, whose lease counts instead. In lock step no lease counts.
         """
         if self._controls.homing is Homing.GOING:
             return self._lock_step or self._controls.home_lease_is_valid()

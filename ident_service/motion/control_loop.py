@@ -113,7 +113,7 @@ class Loop:
         self._hold_speed = HOLD_SPEED * self.limits.velocity
 
     def run(self, target: Vector, first: Sample | None = None) -> None:
-        """Run cycles until DONE, or STOPPED and the hold or lowering over; ArmFault where torque must end now.
+        """Send `target`, then run cycles until DONE or a stopped arm is secured; ArmFault where torque must end now.
 
         Args:
             target: target of the first cycle, which holds the arm where it stands, shape (joints,): torque [N m or N],
@@ -153,7 +153,7 @@ class Loop:
             reference,
             self.control.velocity,
             self.control.correction,
-            self.control.answer,
+            self.control.feedback_acceleration,
             self.deadlines.elapsed,
             self.control.feedforward,
             known=self.deadlines.known,

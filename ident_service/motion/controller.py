@@ -32,7 +32,7 @@ class ComputedTorque:
         correction: feedback part of the last torque, `M(q) (K_d (dq_r - dq) + K_p (q_r - q))` [N m or N],
             shape (joints,); nothing when the arm is only damped.
         feedforward: friction in the last torque [N m or N], shape (joints,); nothing when the arm is only damped.
-        answer: feedback acceleration, `K_d (dq_r - dq) + K_p (q_r - q)` [rad/s^2 or m/s^2], shape (joints,); nothing
+        feedback_acceleration: `K_d (dq_r - dq) + K_p (q_r - q)` [rad/s^2 or m/s^2], shape (joints,); nothing
             when the arm is only damped.
     """
 
@@ -66,7 +66,7 @@ class ComputedTorque:
         self._none = np.zeros_like(position)
         # While some are missing: what was measured last [rad or m], and how long ago [s], shape (joints,) each.
         self._missing: tuple[Vector, Vector] | None = None
-        self.correction = self.answer = self.feedforward = self._none
+        self.correction = self.feedback_acceleration = self.feedforward = self._none
 
     def torque(self, position: Vector, valid: Flags, reference: Setpoint, elapsed: float | None = None) -> Vector:
         """Return the computed torque for the next cycle [N m or N], not yet limited; updates the velocity filter.
@@ -82,8 +82,10 @@ class ComputedTorque:
             Torque [N m or N], shape (joints,), not yet limited.
         """
         position = self._filtered(position, valid, elapsed)
-        self.answer = self._kd * (reference.velocity - self.velocity) + self._kp * (reference.position - position)
-        torque = self._dynamics.torque(position, self.velocity, reference.acceleration + self.answer)
+        self.feedback_acceleration = self._kd * (reference.velocity - self.velocity) + self._kp * (
+            reference.position - position
+        )
+        torque = self._dynamics.torque(position, self.velocity, reference.acceleration + self.feedback_acceleration)
         self.correction = torque - self._dynamics.torque(position, self.velocity, reference.acceleration)
         if self._friction is None:
             return torque
@@ -99,7 +101,7 @@ class ComputedTorque:
         elapsed: float | None = None,
         back: Vector | float = 0.0,
     ) -> Vector:
-        """Return the torque that damps motion, compensates a share of gravity and pulls by `back`; not yet limited.
+        """Update the velocity filter; return torque that damps motion, bears `share` of gravity and pulls by `back`.
 
         Args:
             position: as for `torque`.
@@ -113,9 +115,9 @@ class ComputedTorque:
             Torque [N m or N], shape (joints,), not yet limited.
         """
         position = self._filtered(position, valid, elapsed)
-        self.correction = self.answer = self.feedforward = self._none
-        answer = self._kp * back - self._kd * self.velocity
-        torque = self._dynamics.torque(position, self.velocity, answer) + added
+        self.correction = self.feedback_acceleration = self.feedforward = self._none
+        acceleration = self._kp * back - self._kd * self.velocity
+        torque = self._dynamics.torque(position, self.velocity, acceleration) + added
         if share < 1.0:
             torque = torque - (1.0 - share) * self._dynamics.torque(position, self._none, self._none)
         return torque

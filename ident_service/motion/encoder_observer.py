@@ -148,7 +148,7 @@ class FrozenEncoderObserver:
         self._hidden = self._encoders.largest_motions(hidden)
         self._speed, self._way = np.zeros_like(friction), np.zeros_like(friction)
         # Push, feedback acceleration and friction fed forward with which each position last changed.
-        self._base, self._base_answer, self._base_fed = ([0.0] * len(friction) for _ in range(3))
+        self._base, self._base_acceleration, self._base_fed = ([0.0] * len(friction) for _ in range(3))
         self._none: Flags = np.zeros(len(friction), dtype=bool)
         self._direction, self._slid, self._step = ([0.0] * len(friction) for _ in range(3))
         self._cycle, self._slides_within = 0, max(1, round(SLID / period))
@@ -159,7 +159,7 @@ class FrozenEncoderObserver:
         self,
         steps: Vector,
         correction: Vector,
-        answer: Vector,
+        feedback_acceleration: Vector,
         position: Vector,
         feedforward: Vector | float = 0.0,
     ) -> Flags:
@@ -170,7 +170,7 @@ class FrozenEncoderObserver:
                 (joints + drives,).
             correction: feedback torque [N m or N], shape (joints,); all zero where no position is asked for, which
                 allows no conclusion.
-            answer: feedback acceleration [rad/s^2 or m/s^2], shape (joints,).
+            feedback_acceleration: of the control law [rad/s^2 or m/s^2], shape (joints,).
             position: last known position [rad or m], shape (joints,).
             feedforward: friction in the torque [N m or N], shape (joints,).
 
@@ -181,9 +181,9 @@ class FrozenEncoderObserver:
         encoders, given = self._encoders, correction
         fed = feedforward if isinstance(feedforward, np.ndarray) else np.full(correction.shape, feedforward)
         fed = encoders.forces(fed)
-        correction, answer = encoders.forces(correction), encoders.velocities(answer)
+        correction, feedback_acceleration = encoders.forces(correction), encoders.velocities(feedback_acceleration)
         pushed = correction + fed
-        self._note_changes(steps, pushed, answer, fed)
+        self._note_changes(steps, pushed, feedback_acceleration, fed)
         shifts = [push - base for push, base in zip(pushed.tolist(), self._base, strict=True)]
         limits = zip(shifts, self._slid, self._sliding, self._standing, strict=True)
         most = [sliding if shift * slid > 0.0 else standing for shift, slid, sliding, standing in limits]
@@ -192,16 +192,16 @@ class FrozenEncoderObserver:
             self._reset_estimate()
             return self._none
         if not given.any():
-            self._base, self._base_answer = correction.tolist(), answer.tolist()
+            self._base, self._base_acceleration = correction.tolist(), feedback_acceleration.tolist()
             self._base_fed = [0.0] * len(self._base)
             self._reset_estimate()
             return self._none
         change, inertia = np.array(shifts), encoders.inertias(self._dynamics.mass_matrix(position))
-        braking = np.maximum(-np.array(self._slid) * (inertia * self._base_answer + self._base_fed), 0.0)
+        braking = np.maximum(-np.array(self._slid) * (inertia * self._base_acceleration + self._base_fed), 0.0)
         stopping = (braking + self._standing) / inertia * self._period**2  # twice the longest step that ends at rest
         rests = np.array(self._step) <= stopping
         allowed = np.where(rests, np.minimum(np.array(most) + braking, self._standing), most)
-        own = np.sign(change) * (inertia * (answer - self._base_answer) + fed - self._base_fed)
+        own = np.sign(change) * (inertia * (feedback_acceleration - self._base_acceleration) + fed - self._base_fed)
         push = np.minimum(np.abs(change), own) - allowed
         acting, gained = push > 0.0, push / encoders.inertias(self._least.mass_matrix(position)) * self._period
         self._speed = np.where(acting, self._speed + gained, 0.0)
@@ -219,7 +219,7 @@ class FrozenEncoderObserver:
             slides = towards == self._direction[k] and self._cycle - self._stepped[k] <= self._slides_within
             self._slid[k] = towards if slides else 0.0
             self._direction[k], self._stepped[k] = towards, self._cycle
-            self._base[k], self._base_answer[k], self._base_fed[k] = push, acceleration, friction
+            self._base[k], self._base_acceleration[k], self._base_fed[k] = push, acceleration, friction
 
     def _reset_estimate(self) -> None:
         if self._owing:

@@ -92,7 +92,7 @@ def send_line(line: dict[str, Any]) -> None:
 
 
 def main() -> int:
-    """Run the motion that standard input asks for and report on standard output; return 0 without fault, 4 with one."""
+    """Run the motion that standard input asks for, report on standard output; return 0, 4 after a fault, else 1."""
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the terminal's Ctrl-C is for the parent, which asks for a stop
     line = sys.stdin.readline()

@@ -112,7 +112,7 @@ class PointToPointPlan:
         """Do nothing: home is inside the limits by the description's own check, as is the nearest posture inside."""
 
     def admits(self, model: ArmModel, position: Vector, limits: MotionLimits) -> MotionLimits:
-        """Return limits widened to where the arm stands; MotionRefused if too far outside, or nothing is to be left."""
+        """Return limits widened to the arm's position; MotionRefused if too far outside, or if `INSIDE` is reached."""
         require_near(position, limits, model.chain.names)
         if self.destination is Destination.INSIDE and not position_limit_violations(
             position, limits, model.chain.names

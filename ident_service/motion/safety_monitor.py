@@ -354,7 +354,7 @@ class SafetyMonitor:
         reference: Setpoint,
         velocity: Vector,
         correction: Vector,
-        answer: Vector | None = None,
+        feedback_acceleration: Vector | None = None,
         elapsed: float | None = None,
         feedforward: Vector | float = 0.0,
         *,
@@ -368,7 +368,7 @@ class SafetyMonitor:
             reference: setpoint at the sample's stamp.
             velocity: filtered velocity before this sample [rad/s or m/s], shape (joints,).
             correction: feedback part of the torque before this sample [N m or N], shape (joints,).
-            answer: feedback acceleration in that torque [rad/s^2 or m/s^2], shape (joints,); without it,
+            feedback_acceleration: the acceleration in that torque [rad/s^2 or m/s^2], shape (joints,); without it,
                 `encoder_observer` is not updated.
             elapsed: time since the sample before [s]; one period when None.
             known: whether `elapsed` is the true time; if not, it is the longest that it may be.
@@ -397,9 +397,11 @@ class SafetyMonitor:
             same &= encoders.steps(self._target, self._previous_target) != 0.0
             self._previous_target = self._target
         self._count_unchanged(same, velocity)
-        if self._encoder_observer is not None and answer is not None:
+        if self._encoder_observer is not None and feedback_acceleration is not None:
             seen = np.where(valid, steps, 0.0)
-            self._owes = self._encoder_observer.update(seen, correction, answer, self._position, feedforward)
+            self._owes = self._encoder_observer.update(
+                seen, correction, feedback_acceleration, self._position, feedforward
+            )
         held = answered and self._all_fresh and self._quiet(sample.position, reference.position, velocity)
         if held and self._plain(sample):
             # Copied, in case that a driver fills the same array again.

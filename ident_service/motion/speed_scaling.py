@@ -37,7 +37,7 @@ class ScaledMotion:
 
 
 def slowed_limits(limits: MotionLimits, factor: float) -> MotionLimits:
-    """Return limits with velocity scaled by `factor`, acceleration by its square, and jerk by its cube.
+    """Return limits with velocity times `factor`, acceleration its square, jerk its cube; UsageError if not in (0, 1].
 
     Raises:
         UsageError: the factor is not above 0 and at most 1.

@@ -391,7 +391,7 @@ def read_ticket(path: Path) -> Ticket:
 
 
 def ticket_from_json(text: str) -> Ticket:
-    """Parse a ticket from JSON, the inverse of `Ticket.to_json`.
+    """Parse a ticket from JSON, the inverse of `Ticket.to_json`; UsageError if it is malformed or contradicts itself.
 
     Raises:
         UsageError: not a ticket; the message says what is wrong with it.

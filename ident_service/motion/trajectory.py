@@ -133,7 +133,7 @@ _CALM = 0.5  # of the limits, on the way to a motion and back
 
 
 def plan_reduced_trajectory(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference:
-    """Plan a trajectory within half the velocity and acceleration limits, or more where its ends need it.
+    """Plan a trajectory at half the velocity and acceleration limits, or what its ends need; MotionRefused if none.
 
     A trajectory at the full limits leaves no margin for errors of the model, and a second more does not matter.
 

@@ -112,7 +112,7 @@ class JointResponse:
 
 
 def strokes(session: Session, model: ArmModel, limits: MotionLimits, only: int | None = None) -> list[TestMotion]:
-    """Plan a small test motion, there and back, for every joint, or for the one of number `only`.
+    """Plan a small test motion there and back for each joint, or that of index `only`; MotionRefused without room.
 
     Raises:
         MotionRefused: a joint has no room within its position limits or its surroundings.
@@ -371,7 +371,7 @@ def _clear_test_motion(
 
 
 def expected_displacement(trace: Trace, session: Session, sign: Vector | float = 1.0) -> Vector:
-    """Return the displacement that the model expects of the torque times `sign` [rad or m], (cycles, joints)."""
+    """Return the displacement that the model expects of torque minus gravity [rad or m], (cycles, joints)."""
     acceleration = np.linalg.solve(session.inertia, (sign * (trace.torque - session.gravity)).T).T
     return _integrated_twice(np.asarray(acceleration, dtype=np.float64), trace.period)
 

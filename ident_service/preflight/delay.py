@@ -43,14 +43,14 @@ class Delay:
     deviation: float
 
 
-def dither(session: Session, limits_torque: Vector, joint: int) -> Vector:
+def dither(session: Session, torque_limit: Vector, joint: int) -> Vector:
     """Return the amplitude of a sinusoidal test torque on one joint [N m or N], (joints,); zero in too slow a loop."""
     if FREQUENCY * session.period > 1.0 / _LEAST_SAMPLES:
-        return np.zeros(len(limits_torque))
+        return np.zeros(len(torque_limit))
     pace = 2.0 * np.pi * FREQUENCY
-    calm = CALM * min(TORQUE_RATE, TORQUE_RATE_SHARE * limits_torque[joint]) / pace
-    size = min(_TORQUE * limits_torque[joint], _SPEED * session.inertia[joint, joint] * pace, calm)
-    return np.where(np.arange(len(limits_torque)) == joint, size, 0.0)
+    calm = CALM * min(TORQUE_RATE, TORQUE_RATE_SHARE * torque_limit[joint]) / pace
+    size = min(_TORQUE * torque_limit[joint], _SPEED * session.inertia[joint, joint] * pace, calm)
+    return np.where(np.arange(len(torque_limit)) == joint, size, 0.0)
 
 
 def hidden_delay(trace: Trace, expected: Vector, joint: int) -> Delay | None:

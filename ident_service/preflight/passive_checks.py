@@ -300,7 +300,7 @@ def noise_check(
 
 
 def unreachable(error: ArmError) -> Check:
-    """Return the failed check of an arm that could not be opened or recorded, with the reason."""
+    """Return the failed check `identities` of an arm that could not be opened or recorded, with the reason."""
     remedy = UNREACHABLE_REMEDY
     if isinstance(error, PositionUnknown):
         remedy = "Do this; only a person can tell where the arm is."

@@ -120,7 +120,7 @@ def preflight(
     closed: LastPosition | None = None,
     announce: Callable[[str], None] = lambda action: None,
 ) -> Ticket:
-    """Check an arm and a motion, with small test motions; return the ticket, whatever its verdict.
+    """Open an arm, energise it and move each joint a little, to check it and a motion; return the ticket, good or bad.
 
     Args:
         arm: the arm, not open; it stands on its support, without torque.
@@ -128,7 +128,7 @@ def preflight(
         excitation: motion to be run; None for the path home or out of a limit, which may begin a little outside the
             position limits.
         confirm: function that shows a question and returns what a person typed; called once, before anything is
-            energised.
+            energised. Without the arm's name only the watchdogs are left untried; the joints are moved all the same.
         clock: clock whose UTC stamps the ticket; by default the machine's. The loop has the arm's own.
         tell: called with every check as soon as it is made.
         valid: how long the ticket counts.

@@ -49,7 +49,7 @@ _POSTURES = 8  # of the motion, at which the coupled loop is judged
 
 @unhurried()
 def configuration_check(model: ArmModel, load: Budget | None = None) -> Check:
-    """Return the check `configuration`: limits, gains, a prior that a real body has, and room on the bus are there.
+    """Return the check `configuration`: limits, gains, feasible prior, secured stop, short watchdogs, room on the bus.
 
     Args:
         model: of the arm.
@@ -110,7 +110,7 @@ def motion_fits_check(model: ArmModel, excitation: Excitation) -> Check:
 
 @unhurried()
 def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excitation) -> Check:
-    """Return the check `motion_proven`: the motion, the way to it from home and every stop are proven within limits."""
+    """Return the check `motion_proven`: motion and sampled stops keep the limits, the way from home the clearance."""
     code, remedy = "motion_proven", "Design the motion again, with larger margins or a smaller share of the limits."
     if model.config.point_speed_limit is not None:
         remedy = f"{remedy} {_SLOWER}"
@@ -144,7 +144,7 @@ def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excit
 
 
 def point_speeds(model: ArmModel, position: Vector, seconds: Vector, what: str) -> list[Measure]:
-    """Return a measure of the fastest frame's speed [m/s], limited as the arm's safety system is; none without such.
+    """Return a list of one measure, the fastest frame's speed [m/s] with its limit; empty where none is described.
 
     Args:
         model: of the arm.
@@ -218,7 +218,7 @@ def distance_from_home_text(model: ArmModel, limits: MotionLimits, position: Vec
 
 
 def path_home_check(model: ArmModel, limits: MotionLimits, position: Vector) -> Check:
-    """Return the check `ways_clear`: the straight way home from `position` [rad or m], (joints,), is clear."""
+    """Return the check `ways_clear`: the straight way home is clear and slow enough, from `position` [rad or m]."""
     code = "ways_clear"
     try:
         ((_, leg),) = PointToPointPlan(Destination.HOME).legs(model, position, limits)
@@ -229,7 +229,7 @@ def path_home_check(model: ArmModel, limits: MotionLimits, position: Vector) -> 
 
 
 def paths_check(model: ArmModel, limits: MotionLimits, excitation: Excitation, position: Vector) -> Check:
-    """Return the check `ways_clear`: the ways from `position` to the motion and back are within limits and clear.
+    """Return the check `ways_clear`: ways from `position` to the motion and back keep limits, clearance and speed.
 
     Args:
         model: of the arm.

@@ -60,7 +60,7 @@ class Consent:
 
 
 def confirm_watchdog_test(model: ArmModel, sample: Sample, confirm: Confirm) -> Consent:
-    """Ask a person for the arm's name, to allow the watchdog test; return the consent, or the check that says why not.
+    """Ask a person for the arm's name, to allow the watchdog test; return whether it is allowed, or the check why not.
 
     Args:
         model: model of the arm, whose name must be typed.
