@@ -94,7 +94,7 @@ from ident_service.preflight.static_checks import (
     paths_check,
     stability_check,
 )
-from ident_service.preflight.watchdog import CODE, Confirm, Consent, confirm_watchdog_test, watchdog_check
+from ident_service.preflight.watchdog import CODE, Confirm, consent_check, watchdog_check
 
 LOOK = 1.0  # s
 RESTS = 3.0  # s that an arm may take to come to rest when its drives have stopped
@@ -128,7 +128,7 @@ def preflight(
         excitation: motion to be run; None for the path home or out of a limit, which may begin a little outside the
             position limits.
         confirm: function that shows a question and returns what a person typed; called once, before anything is
-            energised. Without the arm's name only the watchdogs are left untried; the joints are moved all the same.
+            energised. Without the arm's name nothing is.
         clock: clock whose UTC stamps the ticket; by default the machine's. The loop has the arm's own.
         tell: called with every check as soon as it is made.
         valid: how long the ticket counts.
@@ -222,7 +222,9 @@ class _Preflight:
     def all_checks(self) -> list[Check]:
         """Return every check; those that were not made name the one that failed."""
         because = next((code for code, check in self.checks.items() if check.verdict is Verdict.FAILED), None)
-        why = "not reached, although nothing failed before" if because is None else f"because {because} failed"
+        asked = any(check.verdict is Verdict.NEEDS_PERSON for check in self.checks.values())
+        why = "because nobody agreed to it" if asked else "not reached, although nothing failed before"
+        why = why if because is None else f"because {because} failed"
         made = dict(self.checks)
         if self.excitation is None:
             made |= {code: skipped(code, "no motion was given") for code in ("motion_fits", "motion_proven")}
@@ -237,7 +239,7 @@ class _Preflight:
         # Drives would take us for dead, above all while a person thinks.
         with keep_host_alive(self.arm):
             agreed = self._agreed(looked, limits)
-        if agreed is None:
+        if not agreed:
             return
         # A person may have taken minutes to answer, and may have moved the arm meanwhile.
         again = record_idle(self.arm, _LOOK_AGAIN, period)
@@ -250,20 +252,20 @@ class _Preflight:
             friction = _felt_friction(self.model, limits)
             session = Session(self.arm, self.model, limits, self.described, home, friction)
             planned = self._planned(session)
-        self._touched(session, planned, _Gravity(session.gravity, limits, friction), try_watchdog=agreed.given)
+        self._touched(session, planned, _Gravity(session.gravity, limits, friction))
 
     def _bounds(self, limits: MotionLimits) -> MotionLimits:
         """Return where the run may begin: inside the limits; for the path home as far outside as `reachable` allows."""
         return limits if self.excitation is not None else recoverable_limits(limits)
 
-    def _agreed(self, looked: IdleRecording, limits: MotionLimits) -> Consent | None:
-        """Check the arm at rest; returns whether its watchdog may be tried, None where the arm may not be touched."""
+    def _agreed(self, looked: IdleRecording, limits: MotionLimits) -> bool:
+        """Check the arm at rest; returns whether it may be energised, to which a person has agreed."""
         if self.described is None or not self._passed(
             identities_check(self.described, self.model, limits, looked, self.arm.setup_checks())
         ):
-            return None
+            return False
         if not self._passed(at_rest_check(looked, self.model, self._bounds(limits), self.closed)):
-            return None
+            return False
         home = looked.samples[-1].position.copy()
         if self.excitation is not None:
             self.away = distance_from_home_text(self.model, limits, home)
@@ -277,14 +279,12 @@ class _Preflight:
         session = Session(self.arm, self.model, limits, self.described, home, friction)
         self._passed(noise_check(looked, self.described, self.model, limits, session.mass))
         if any(c.verdict is Verdict.FAILED and c.code not in ABOUT_THE_MOTION for c in self.checks.values()):
-            return None
+            return False
         if (impossible := holdable(session.gravity, self.model, limits)) is not None:
             self._passed(impossible, of_place=True)
-            return None
-        agreed = confirm_watchdog_test(self.model, looked.samples[-1], self.confirm)
-        if agreed.check is not None:
-            self._passed(agreed.check)
-        return agreed
+            return False
+        refused = consent_check(self.model, looked.samples[-1], self.confirm)
+        return refused is None or self._passed(refused)
 
     def _planned(self, session: Session) -> list[TestMotion]:
         """Plan a small test motion of every joint; none, and a failed check, where a joint has no room."""
@@ -297,9 +297,7 @@ class _Preflight:
             self._passed(failed("direction", str(error), remedy), of_place=True)
             return []
 
-    def _touched(
-        self, session: Session, planned: Sequence[TestMotion], gravity: _Gravity, *, try_watchdog: bool
-    ) -> None:
+    def _touched(self, session: Session, planned: Sequence[TestMotion], gravity: _Gravity) -> None:
         """Hold the arm, move it a little, and fall silent; judge the findings after torque is off."""
         held: Rows = ()
         moved: list[tuple[Rows, Rows]] = []
@@ -310,8 +308,7 @@ class _Preflight:
             if planned and gravity.carried_by(holding_torque(held, session.period)):
                 moved += (follow_stroke(session, one) for one in planned)
                 session.follow(hold(session.home), SETTLE)
-                if try_watchdog:
-                    silent = watchdog_check(self.arm, self.model, session, hold(session.home).at)
+                silent = watchdog_check(self.arm, self.model, session, hold(session.home).at)
             if silent is None:
                 session.release()
         except ArmError as error:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -46,43 +45,32 @@ REMEDY = (
 Confirm = Callable[[str], str]
 
 
-@dataclass(frozen=True)
-class Consent:
-    """Represent whether the drives' watchdog may be tried.
-
-    Attributes:
-        given: whether it may be tried.
-        check: the check to report where it may not, else None.
-    """
-
-    given: bool
-    check: Check | None
-
-
-def confirm_watchdog_test(model: ArmModel, sample: Sample, confirm: Confirm) -> Consent:
-    """Ask a person for the arm's name, to allow the watchdog test; return whether it is allowed, or the check why not.
+def consent_check(model: ArmModel, sample: Sample, confirm: Confirm) -> Check | None:
+    """Ask a person for the arm's name, without which nothing is energised; return None if given, else the failed check.
 
     Args:
         model: model of the arm, whose name must be typed.
-        sample: sample of the arm without torque; without status words the drives' reaction cannot be seen.
+        sample: sample of the arm without torque; without status words the drives' reaction cannot be seen, and nobody
+            is asked.
         confirm: function that shows a question and returns what the person typed.
     """
     if not sample.status:
         why = "the driver does not report drive states, so the watchdogs cannot be tested"
         remedy = "Nothing moves without this proof: have the driver report the state of each drive in `Sample.status`."
-        return Consent(False, failed(CODE, why, remedy))
+        return failed(CODE, why, remedy)
     name = model.config.name
     typed = confirm(
-        f"The drives' own watchdog is tried at the end, at rest and in a small motion: they hear no more of what "
-        f"it watches, must give up torque by themselves, and an arm without brakes sinks. If {name} is supported where "
-        f"it stands and nobody is within its reach, type its name: "
+        "Now the arm gets torque: it is held where it stands, and every joint moves a little. At the end the drives' "
+        "own watchdog is tried, at rest and in a small motion: they hear no more of what it watches, must give up "
+        f"torque by themselves, and an arm without brakes sinks. If {name} is supported where it stands and nobody is "
+        "within its reach, type its name: "
     )
     if typed.strip() == name:
-        return Consent(True, None)
+        return None
     wrong = f"{typed.strip()!r} is not" if typed.strip() else "nobody typed"
-    why = f"{wrong} the arm's name, {name}, so the drives' watchdog was not tried"
+    why = f"{wrong} the arm's name, {name}, so the arm got no torque and the drives' watchdog was not tried"
     remedy = "Support the arm, step out of its reach, check again and type its name when asked."
-    return Consent(False, Check(CODE, Verdict.NEEDS_PERSON, (), why, remedy))
+    return Check(CODE, Verdict.NEEDS_PERSON, (), why, remedy)
 
 
 def watchdogs_of(arm: Arm, model: ArmModel) -> tuple[Watchdog, ...]:

@@ -12,9 +12,3 @@ from drivers.clock import VirtualClock
 def good() -> Flown:
     """A good arm, whose name was typed, by a clock that began at 1,700,000,000 s and 1 s later told the date."""
     return Flown(Flight(clock=VirtualClock(10**9, 1_700_000_000 * 10**9)))
-
-
-@pytest.fixture(scope="session")
-def unnamed() -> Flown:
-    """A good arm, whose name nobody typed."""
-    return Flown(Flight(typed=" "))

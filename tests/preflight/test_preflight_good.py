@@ -19,7 +19,7 @@ from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.motion.arm_factory import make_arm
-from ident_service.motion.ticket import CODES, Ticket, Verdict
+from ident_service.motion.ticket import CODES, Verdict
 from ident_service.motion.trajectory import Setpoint
 from ident_service.preflight.active_checks import LEAST_ANSWER
 from ident_service.preflight.preflight import preflight
@@ -83,22 +83,22 @@ def test_a_person_is_asked_by_the_arms_name_before_anything_is_energised(good: F
     assert "sinks" in question
 
 
-def is_handed_back(ticket: Ticket, why: str) -> None:
+@pytest.mark.parametrize(
+    ("typed", "why"),
+    [("", "nobody typed the arm's name, bench,"), ("yes", "'yes' is not the arm's name, bench,")],
+)
+def test_without_the_name_nothing_is_energised(typed: str, why: str) -> None:
+    """Who does not confirm that nobody is within reach may have somebody there."""
+    flight = Flight(typed=typed)
+    ticket = flight.ticket()
     assert ticket.verdict is Verdict.NEEDS_PERSON
     check = check_of(ticket, "watchdog")
     assert check.verdict is Verdict.NEEDS_PERSON
     assert check.reason.startswith(why)
     assert "type its name" in check.remedy
-    assert verdicts(ticket)["direction"] is Verdict.PASSED
-
-
-def test_without_the_name_the_watchdog_is_not_tried_and_the_arm_is_handed_back_to_its_support(unnamed: Flown) -> None:
-    is_handed_back(unnamed.ticket, "nobody typed the arm's name, bench,")
-
-
-@pytest.mark.slow
-def test_another_word_is_not_the_name() -> None:
-    is_handed_back(Flight(typed="yes").ticket(), "'yes' is not the arm's name, bench,")
+    assert check_of(ticket, "direction").reason == "because nobody agreed to it"
+    assert "enable" not in flight.arm.calls
+    assert flight.arm.torques == []
 
 
 @pytest.mark.slow
@@ -110,6 +110,7 @@ def test_a_driver_that_does_not_tell_about_its_drives_gets_no_ticket_and_nobody_
     assert check.verdict is ticket.verdict is Verdict.FAILED
     assert "Sample.status" in check.remedy
     assert flight.questions == []
+    assert "enable" not in flight.arm.calls
     assert ticket.valid_for(ticket.subject, ticket.created) == ["checks failed: watchdog"]
 
 
