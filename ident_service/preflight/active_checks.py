@@ -12,18 +12,20 @@ whether the sign was why.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident_service.config.motion_limits import MotionLimits, Vector
+from ident_service.config.motion_limits import MotionLimits, Vector, motion_limits
 from ident_service.errors import ArmFault, MotionRefused
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
 from ident_service.model.expected_friction import ExpectedFriction, expected_friction
 from ident_service.model.zero_phase import local_polynomial
 from ident_service.motion.clearance import trajectory_clearance
+from ident_service.motion.encoder_observer import STANDING
 from ident_service.motion.safety_monitor import TORQUE_RATE, TORQUE_RATE_SHARE
 from ident_service.motion.ticket import Check, Measure, Verdict, check_from_measures, failed, joint_units, measures
 from ident_service.motion.trajectory import Reference, RuckigReference, Setpoint, plan_trajectory, rest
@@ -320,9 +322,10 @@ def direction_check(
         "friction: a larger kp brings it closer. A hidden delay is in the drive's filters or its interpolation, or "
         "belongs into identification.delay.",
     )
-    if odd and check.verdict is Verdict.PASSED:
-        return replace(check, reason=_of_odd_answers(odd, model))
-    return check
+    if check.verdict is not Verdict.PASSED:
+        return check
+    remarks = [*([_of_odd_answers(odd, model)] if odd else []), *_of_friction(model, session.dry_friction)]
+    return replace(check, reason=". ".join(remarks)) if remarks else check
 
 
 def _dry_friction(model: ArmModel) -> Vector:
@@ -347,6 +350,23 @@ def _of_odd_answers(odd: Sequence[tuple[str, str]], model: ArmModel) -> str:
         f"{found}Nothing to do where gear ratios and torque constants of this arm have been checked. Where they have"
         " not, do `ident preflight ARM --scale` before the motion: with a gear ratio configured twice too large a joint"
         " responds 0.25 times as much, with half of the torque 0.5 times"
+    )
+
+
+def _of_friction(model: ArmModel, felt: Vector) -> Iterator[str]:
+    """Yield a sentence where drives have so much more dry friction than expected that they may seem frozen in a run."""
+    limits, guess = motion_limits(model.config), model.config.design.friction_guess
+    expected = expected_friction(model, limits, guess)
+    most = 0.5 * STANDING * np.maximum(expected.coulomb, guess[0] * limits.torque) + expected.viscous * 0.5 * SPEED
+    dry = [k for k in range(len(felt)) if felt[k] > most[k]]
+    if not dry:
+        return
+    names, values = ", ".join(model.chain.names[k] for k in dry), ", ".join(f"{felt[k]:.2g}" for k in dry)
+    share = max(math.ceil(100.0 * felt[k] / limits.torque[k]) for k in dry) / 100.0
+    yield (
+        f"{names}: friction takes {values} N m or N, more than is expected. Where such a joint reverses it may stand so"
+        " long that a run takes its encoder for frozen, and ends. Set design.friction_guess to"
+        f" [{share:g}, {guess[1]:g}], and design the motion again"
     )
 
 

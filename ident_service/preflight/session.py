@@ -196,6 +196,8 @@ class Session:
         period: [s].
         torque_limit: torque limits of the description [N m or N], shape (joints,).
         gives_positions: whether the drives are given positions.
+        dry_friction: torque that each drive needed besides the model's when it was moved last while friction was
+            learned, the mean of both directions [N m or N], shape (joints,); 0 for one that was not.
     """
 
     def __init__(
@@ -258,7 +260,7 @@ class Session:
         self._rows: list[tuple[Sample, Setpoint]] = []
         self._first: Sample | None = None  # of an arm that a person has enabled, not judged yet
         self._words: tuple[int, ...] = ()
-        self._friction = still
+        self._friction, self.dry_friction = still, still.copy()
         self._coupling = model.chain.coupling
         # With a load, or drives that share joints, the model's gravity is less well known: see `follow`.
         coupled = not np.array_equal(self._coupling, np.eye(len(self._coupling)))
@@ -327,11 +329,15 @@ class Session:
             if learning and not self.gives_positions and setpoint.velocity.any():
                 learned.setdefault(bool(setpoint.velocity.sum() > 0.0), []).append(self._friction)
             if elapsed >= seconds:
-                if learned and self._averages:
+                if learned:
                     # What the model lacks of gravity is taken for friction on one way, and against it on the other.
                     # The first half of a way is where it is still being learned.
                     halves = [np.mean(way[len(way) // 2 :], axis=0) for way in learned.values()]
-                    self._friction = np.mean(halves, axis=0)
+                    mean = np.mean(halves, axis=0)
+                    moved = np.any([np.abs(self._coupling @ asked.velocity) > CREEP for _, asked in self._rows], axis=0)
+                    self.dry_friction = np.where(moved, mean, self.dry_friction)
+                    if self._averages:
+                        self._friction = mean
                 return self._rows
 
     def gravity_at(self, positions: Vector) -> Vector:

@@ -102,6 +102,22 @@ def test_without_the_name_nothing_is_energised(typed: str, why: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("guess", "told"), [(0.02, True), (0.04, False)])
+def test_a_joint_with_more_friction_than_expected_is_told_before_a_run_takes_it_for_frozen(
+    guess: float, told: bool
+) -> None:
+    """The boom has 1.9 times what a guess of 2 % allows; the gravity of its tool, which nobody described, is none."""
+    shipped = load_arm("threelink")
+    design = shipped.design.model_copy(update={"friction_guess": (guess, 0.05)})
+    config = shipped.model_copy(update={"design": design})
+    ticket = preflight(make_arm(config), arm_model(config), None, confirm=lambda _: config.name, look_seconds=0.2)
+    check = check_of(ticket, "direction")
+    assert check.verdict is Verdict.PASSED
+    assert check.reason.startswith("slide: friction takes 2 N m or N, more than is expected") == told
+    assert ("Set design.friction_guess to [0.06, 0.05]" in check.reason) == told
+
+
+@pytest.mark.slow
 def test_a_driver_that_does_not_tell_about_its_drives_gets_no_ticket_and_nobody_is_asked() -> None:
     flight = Flight()
     flight.arm.shown = lambda sample: replace(sample, status=())
