@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
+from scipy.optimize import lsq_linear
 
 from ident_service.config.motion_design import Criterion
 from ident_service.config.motion_limits import MotionLimits
@@ -84,8 +84,7 @@ def binding(task: Task, coefficients: Array, per_period: int) -> tuple[ActiveLim
             by_gain.append(1.0 if name == "following error" else speed)
     if not slopes:
         return ()
-    forces, _ = nnls(np.array(slopes).T, -alone)
-    forces = np.minimum(forces, _MOST)
+    forces = forces_of(np.array(slopes).T, -alone)
     total: dict[tuple[str, int | None], tuple[float, float]] = {}
     for owner, force, part in zip(owners, forces.tolist(), by_gain, strict=True):
         cost, stiffer = total.get(owner, (0.0, 0.0))
@@ -95,6 +94,19 @@ def binding(task: Task, coefficients: Array, per_period: int) -> tuple[ActiveLim
         for owner, costs in sorted(total.items(), key=lambda item: -item[1][0])
         if costs[0] > 0.0
     )
+
+
+def forces_of(slopes: Array, pull: Array) -> Array:
+    """Return the forces of limits, 0 to 50, that balance the criterion's gradient best, shape (limits,).
+
+    Neighbouring samples have nearly the same slope, with which scipy's `nnls` may give up after any number of rounds.
+
+    Args:
+        slopes: gradient of each limit, shape (variables, limits).
+        pull: negative gradient of the criterion, shape (variables,).
+    """
+    found = lsq_linear(slopes, pull, bounds=(0.0, _MOST), method="bvls", max_iter=10 * slopes.shape[1])
+    return np.asarray(np.maximum(found.x, 0.0))
 
 
 def needed_stiffness(task: Task, coefficients: Array, per_period: int) -> Array:

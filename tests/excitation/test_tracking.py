@@ -18,6 +18,7 @@ from ident_service.errors import MotionRefused
 from ident_service.excitation.active_limits import (
     active_limit_lines,
     binding,
+    forces_of,
     gain_words,
     needed_stiffness,
     stiffer_gains,
@@ -183,6 +184,21 @@ def test_a_wider_active_limit_gains_as_predicted() -> None:
     assert best.value - more.value == pytest.approx(expected * np.log(1.1), rel=0.3)
     words = active_limit_lines(found, task, motion_limits(model.config), task.limits.velocity, ("rad", "rad"))
     assert any("elbow is limited by its velocity; 1.2 could give up to about" in line for line in words)
+
+
+@pytest.mark.parametrize("seed", [50, 302, 682])
+def test_forces_are_found_where_slopes_are_nearly_the_same(seed: int) -> None:
+    """On these an active-set method gives up that insists on an exact end; the gradients are balanced all the same."""
+    rng = np.random.default_rng(seed)
+    rows, columns = rng.integers(5, 80), rng.integers(5, 120)
+    rank = rng.integers(1, max(2, min(rows, columns)))
+    slopes = rng.normal(size=(rows, rank)) @ rng.normal(size=(rank, columns)) * 10.0 ** rng.uniform(-6, 6, columns)
+    if seed % 2:
+        slopes = slopes[:, rng.integers(0, columns, columns)] * (1.0 + 1e-12 * rng.normal(size=columns))
+    pull = slopes @ np.clip(rng.normal(size=columns), 0.0, 10.0)
+    forces = forces_of(slopes, pull)
+    assert (forces >= 0.0).all()
+    assert np.linalg.norm(slopes @ forces - pull) < 1e-6 * np.linalg.norm(pull)
 
 
 @pytest.fixture(scope="module")
