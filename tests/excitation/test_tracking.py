@@ -186,9 +186,9 @@ def test_a_wider_active_limit_gains_as_predicted() -> None:
     assert any("elbow is limited by its velocity; 1.2 could give up to about" in line for line in words)
 
 
-@pytest.mark.parametrize("seed", [50, 302, 682])
+@pytest.mark.parametrize("seed", [302, 572, 682])
 def test_forces_are_found_where_slopes_are_nearly_the_same(seed: int) -> None:
-    """On these an active-set method gives up that insists on an exact end; the gradients are balanced all the same."""
+    """On these scipy's `nnls` gives up; the gradients are balanced all the same."""
     rng = np.random.default_rng(seed)
     rows, columns = rng.integers(5, 80), rng.integers(5, 120)
     rank = rng.integers(1, max(2, min(rows, columns)))
