@@ -764,9 +764,9 @@ def _figures(arguments: argparse.Namespace) -> Answer:
 
 
 def _view(arguments: argparse.Namespace) -> Answer:
-    from ident_service.operations.run_view import view_run
+    from ident_service.operations.run_view import show_run_in_viewer
 
-    seen = view_run(arguments.run, arguments.recording, arguments.save, arguments.urdf)
+    seen = show_run_in_viewer(arguments.run, arguments.recording, arguments.save, arguments.urdf)
     text = f"recordings: {', '.join(seen.recordings)}\n"
     text += f"residuals: {', '.join(seen.residuals) or 'none; identify parameters from the recording first'}\n"
     if seen.saved is not None:

@@ -198,14 +198,14 @@ def run_and_report(
             state,
             read_ticket(path),
             speed=speed,
-            lease=LEASE_SECONDS if lease is None else lease,
+            lease_seconds=LEASE_SECONDS if lease is None else lease,
             log_frames=arguments.can_log,
-            begin=begin,
+            on_begin=begin,
             requested_ns=arguments.requested_ns,
             tell=entered,
-            moved=moved,
+            on_progress=moved,
             stop_requested=stop_requested,
-            until=until,
+            target=until,
         )
     except IdentError as error:
         if begun and folder.exists():

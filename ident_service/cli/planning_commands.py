@@ -460,7 +460,7 @@ def _scan(arguments: argparse.Namespace) -> Answer:
 
 def _probe(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm, sheet_file
-    from ident_service.operations.fieldbus import FILE, bus_probe, keep_outcome, probe_document, probe_text
+    from ident_service.operations.fieldbus import FILE, bus_probe, probe_document, probe_text, store_probe_outcome
     from ident_service.registry.state_folder import arm_folder
 
     config = load_arm(arguments.arm)
@@ -468,7 +468,7 @@ def _probe(arguments: argparse.Namespace) -> Answer:
     text, document = probe_text(config, found), probe_document(config, found)
     if not arguments.eds:
         path = arm_folder(writable_state_folder(arguments), config.name) / FILE
-        document |= {"changed": keep_outcome(path, document), "kept": str(path)}
+        document |= {"changed": store_probe_outcome(path, document), "kept": str(path)}
         text += "".join(f"CHANGED: {line}\n" for line in document["changed"]) + f"kept in {path}\n"
     return DONE if found.good else VERDICT_NO if found.readable else USAGE, text, document
 

@@ -180,7 +180,7 @@ def _recover(arguments: argparse.Namespace) -> Answer:
         raise UsageError("--lease-from-stdin is for --leave-limit; without it nothing moves")
     if arguments.can_log:
         raise UsageError("--can-log is for --leave-limit; without it nothing moves")
-    found = recover(config, writable_state_folder(arguments), called=arguments.arm)
+    found = recover(config, writable_state_folder(arguments), name_in_commands=arguments.arm)
     document = asdict(found) | {"seen": None if found.seen is None else watch_document(found.seen)}
     return DONE if found.usable else VERDICT_NO, _text(found), document
 

@@ -69,7 +69,7 @@ class OpenedRecordings:
 def open_together(
     paths: Sequence[Path],
     model: ArmModel,
-    forms: Mapping[Path, RecordingFormat] = MappingProxyType({}),
+    formats: Mapping[Path, RecordingFormat] = MappingProxyType({}),
     torque: Torque | None = None,
     payloads: Mapping[Path, Payload] = MappingProxyType({}),
 ) -> OpenedRecordings:
@@ -81,7 +81,7 @@ def open_together(
     Args:
         paths: paths of the recordings, as for `open_for_arm`.
         model: the arm, whose `identification.torque` may demand one of them.
-        forms: how each file is laid out, where not as the description says.
+        formats: how each file is laid out, where not as the description says.
         torque: kind of torque that must be used, in place of the description's.
         payloads: known load of each recording that has one, beside that of the description.
 
@@ -89,7 +89,7 @@ def open_together(
         UsageError, RecordingError: as `open_for_arm`; a recording lacks the torque that is demanded.
     """
     asked = torque or model.config.identification.torque
-    found = [open_for_arm(path, model, forms.get(path), asked, payloads.get(path)) for path in paths]
+    found = [open_for_arm(path, model, formats.get(path), asked, payloads.get(path)) for path in paths]
     kinds = [torque_in(recording) for recording in found]
     remarks = tuple(
         f"{recording.path}: left out from {recording.ended:.6g} s after its first sample on: the motion was stopped,"
@@ -107,7 +107,7 @@ def open_together(
         for place, kind in enumerate(kinds):
             if kind == "measured":
                 found[place] = open_for_arm(
-                    paths[place], model, forms.get(paths[place]), "commanded", payloads.get(paths[place])
+                    paths[place], model, formats.get(paths[place]), "commanded", payloads.get(paths[place])
                 )
         kinds = ["commanded" if kind == "measured" else kind for kind in kinds]
     return OpenedRecordings(tuple(found), " and ".join(dict.fromkeys(kinds)), remarks)
@@ -125,7 +125,7 @@ def torque_in(recording: Recording) -> str:
 def open_for_arm(
     path: Path,
     model: ArmModel,
-    form: RecordingFormat | None = None,
+    recording_format: RecordingFormat | None = None,
     torque: Torque | None = None,
     payload: Payload | None = None,
 ) -> Recording:
@@ -134,8 +134,8 @@ def open_for_arm(
     Args:
         path: the file, or `FILE@START:END`.
         model: the arm.
-        form: how this file is laid out, and what to trim; as the arm's description says when None. Its `trim` counts
-            where it is not the description's, which whatever reads the recording leaves out.
+        recording_format: how this file is laid out, and what to trim; as the arm's description says when None. Its
+            `trim` counts where it is not the description's, which whatever reads the recording leaves out.
         torque: kind of torque to read, in place of the description's.
         payload: known load that the arm carried, beside that of the description.
 
@@ -144,10 +144,10 @@ def open_for_arm(
         RecordingError: it does not fit the arm, or nothing moves where standstill is to be left out.
     """
     file, seconds = file_and_range(path)
-    form, gears = form or model.config.recording, model.config.transmission
+    recording_format, gears = recording_format or model.config.recording, model.config.transmission
     # Cached, because quality, friction, equations and evidence each read the recording.
     torque = torque or model.config.identification.torque
-    whole = open_recording(file, model.chain.names, fmt=form, transmission=gears, torque=torque)
+    whole = open_recording(file, model.chain.names, fmt=recording_format, transmission=gears, torque=torque)
     cached = CachedRecording(whole)
     cached.payload = payload
     recording: Recording = cached
@@ -157,12 +157,12 @@ def open_for_arm(
         recording.ended = ended
     if seconds is not None:
         recording = RangeRecording(recording, *seconds, label=path.name.removeprefix(file.name))
-    if form.standstill == "cut":
+    if recording_format.standstill == "cut":
         # Rows near the ends are not used anyway, for want of neighbours; standstill may remain there.
         edge = model.config.identification.edge
         recording = without_standstill(recording, EDGE / USUAL if edge == "choose" else edge)
-    if form.trim != model.config.recording.trim:
-        recording = without_ends(recording, form.trim)
+    if recording_format.trim != model.config.recording.trim:
+        recording = without_ends(recording, recording_format.trim)
     return recording
 
 

@@ -42,9 +42,11 @@ def verify_file(path: Path, arm: str | None = None) -> Verification:
         raise UsageError(f"{error.filename or path}: {error.strerror or error}") from None
 
 
-def custom_note(name: str) -> str:
+def custom_note(arm_name: str) -> str:
     """Return the note that an answer about an arm leaves out its `constraints.custom`."""
-    return f"constraints.custom ({name}) of the description is code that only identify and simulate run; left out here"
+    return (
+        f"constraints.custom ({arm_name}) of the description is code that only identify and simulate run; left out here"
+    )
 
 
 def _arm(arm: str, file: Path) -> tuple[Arm, str | None]:

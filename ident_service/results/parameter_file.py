@@ -72,25 +72,27 @@ _MOST = 10  # mistakes that are reported
 _VALUES, _ENTRIES, _KEYS, _CHARACTERS = 20_000, 200, 1000, 1000
 
 
-def require_schema(content: Any, name: str, where: object, what: str) -> None:
+def require_schema(content: Any, schema_name: str, origin: object, expected: str) -> None:
     """Raise ParameterError unless a document fits the schema `NAME.schema.json`.
 
     Args:
         content: JSON values.
-        name: name of the schema: `parameters`, `evidence`, `comparison` or `payload`.
-        where: file that it comes from or goes to.
-        what: description of the document that is expected, for the message.
+        schema_name: name of the schema: `parameters`, `evidence`, `comparison` or `payload`.
+        origin: file that it comes from or goes to.
+        expected: description of the document that is expected, for the message.
 
     Raises:
         ParameterError: it does not fit; the first mistakes with their places.
     """
-    validator = _validator(name)
+    validator = _validator(schema_name)
     if validator.is_valid(content):
         return
     found = validator.iter_errors(_first(content, [_VALUES]))
     mistakes = sorted(((_place(one.instance_path), one.message) for one in found), key=lambda mistake: mistake[0])
     listed = "; ".join(f"{place}: {message[:200]}" for place, message in mistakes[:_MOST])
-    raise ParameterError(f"{where}: not {what}: {listed or f'something is wrong beyond its first {_ENTRIES} entries'}")
+    raise ParameterError(
+        f"{origin}: not {expected}: {listed or f'something is wrong beyond its first {_ENTRIES} entries'}"
+    )
 
 
 def _first(value: Any, room: list[int]) -> Any:
@@ -125,29 +127,29 @@ def information_document(information: Information) -> list[dict[str, Any]]:
     return joints
 
 
-def information_from(joints: list[dict[str, Any]], base: int) -> Information:
+def information_from(entries: list[dict[str, Any]], base_count: int) -> Information:
     """Return the information of a document, the inverse of `information_document`.
 
     Args:
-        joints: JSON value that `information_document` made.
-        base: number of base parameters.
+        entries: JSON value that `information_document` made.
+        base_count: number of base parameters.
 
     Raises:
         ParameterError: triangles of the wrong size, or about parameters that are not there.
     """
     supports, factors = [], []
-    for number, joint in enumerate(joints, 1):
+    for number, joint in enumerate(entries, 1):
         support = np.array(joint["parameters"], dtype=np.intp)
         size = len(support) + 1
         upper = np.triu_indices(size)
-        if len(joint["triangle"]) != len(upper[0]) or np.any(np.diff(support) <= 0) or np.any(support >= base):
-            raise ParameterError(f"information of joint {number} is not about {base} base parameters")
+        if len(joint["triangle"]) != len(upper[0]) or np.any(np.diff(support) <= 0) or np.any(support >= base_count):
+            raise ParameterError(f"information of joint {number} is not about {base_count} base parameters")
         factor = np.zeros((size, size))
         factor[upper] = joint["triangle"]
         supports.append(support)
         factors.append(factor)
-    rows = np.array([joint["rows"] for joint in joints], dtype=np.int64)
-    return Information(tuple(supports), tuple(factors), rows, base)
+    rows = np.array([joint["rows"] for joint in entries], dtype=np.int64)
+    return Information(tuple(supports), tuple(factors), rows, base_count)
 
 
 MAX_BYTES = 4 * 2**20
@@ -449,12 +451,12 @@ AGREEMENT = 1e-9
 _LARGEST = 1e30  # largest value in SI units; far beyond every arm, and its square is still finite
 
 
-def require_consistent(file: ParameterFile, where: Path) -> None:
+def require_consistent(file: ParameterFile, origin: Path) -> None:
     """Raise ParameterError unless the values of a parameter file agree with each other and are of possible size.
 
     Args:
         file: parameter file that was read.
-        where: origin of the file, for errors.
+        origin: origin of the file, for errors.
 
     Raises:
         ParameterError: a number that no parameter has; base values that the link values do not have; or, without
@@ -467,18 +469,18 @@ def require_consistent(file: ParameterFile, where: Path) -> None:
     for key, values in rows.items():
         largest = max((abs(float(value)) for value in values if value is not None), default=0.0)
         if not largest <= _LARGEST:
-            raise ParameterError(f"{where}: {largest:g} among its {key}; no parameter of an arm is that large")
+            raise ParameterError(f"{origin}: {largest:g} among its {key}; no parameter of an arm is that large")
     scale = AGREEMENT * float(np.abs(file.values).max())
     free = table.get("unconstrained_values")
     unheld = free is not None and file.content.get("feasible_set") == "none"
     if unheld and np.abs(np.array(free, dtype=float) - file.values).max() > scale:
         raise ParameterError(
-            f"{where}: was fitted without constraints, but its values are not its unconstrained values; one of them "
+            f"{origin}: was fitted without constraints, but its values are not its unconstrained values; one of them "
             "was changed"
         )
     delta = named_link_values(file)
     if delta is not None and set(file.base.names) <= set(delta):
-        require_base_values(file.base, np.array([delta[name] for name in file.base.names]), file.values, where)
+        require_base_values(file.base, np.array([delta[name] for name in file.base.names]), file.values, origin)
 
 
 def named_link_values(file: ParameterFile) -> dict[str, float] | None:

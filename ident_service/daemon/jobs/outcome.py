@@ -20,7 +20,7 @@ from ident_service.errors import IdentError
 from ident_service.motion.command_channel import controlling_pid
 from ident_service.motion.ending import ENDED
 from ident_service.operations.drift_alarms import FLEET, raise_fleet_alarms
-from ident_service.operations.moving_arms import held_arm
+from ident_service.operations.moving_arms import is_held
 from ident_service.registry import jobs as rows
 from ident_service.registry.database import Database, Row, note
 from ident_service.registry.motions import MOTION_FILE, MOTIONS, index_motion
@@ -295,7 +295,7 @@ class Orphan:
             self.controlling_pid = has
         if not lives and (has is None or has != self.controlling_pid):
             return ""
-        if has is not None and held_arm(state, row["arm"]):
+        if has is not None and is_held(state, row["arm"]):
             return f" {has} holds {held_until(row['arm'])}"
         if time.monotonic() - self.since < _WAIT:
             return " is being looked for"
@@ -344,7 +344,7 @@ def explain_interrupted(
     recorded: dict[str, str] = {}
     for one in left:
         # A motion has seen the end of its input and stops its arm; a second word would end what holds it.
-        if not (one.row["motion"] and held_arm(state, one.row["arm"])):
+        if not (one.row["motion"] and is_held(state, one.row["arm"])):
             ask_to_end(one.process)
     while left and not closing.is_set():
         for one in tuple(left):

@@ -24,7 +24,7 @@ from ident_service.daemon.jobs.commands import JOBS
 from ident_service.daemon.jobs.outcome import held_until, is_end_unobserved, process_output
 from ident_service.daemon.jobs.requests import MOVES, AnyJobRequest, ArmName, Id, RequestBody
 from ident_service.errors import MotionRefused, UnknownId, UsageError
-from ident_service.operations.moving_arms import held_arm
+from ident_service.operations.moving_arms import is_held
 from ident_service.registry import jobs as rows
 from ident_service.registry.arms import arm_names
 from ident_service.registry.database import Row
@@ -240,13 +240,13 @@ def job_answer_document(service: Service, row: Row) -> answers.JobAnswer:
     shown["detail"] = _named(row["detail"], service, row)
     progress = None if found is None else _named(asdict(found), service, row)
     moves = bool(row["motion"]) and (row["state"] == "running" or is_end_unobserved(row))
-    held = moves and held_arm(service.state, str(row["arm"]))
+    held = moves and is_held(service.state, str(row["arm"]))
     if held and progress is not None:  # it ends when a person says so
         progress |= {"fraction": None, "remaining": None}
     if row["state"] == "queued" and (before := service.engine.live.waits_for(row["id"])) is not None:
         other = service.db.row("SELECT arm FROM jobs WHERE id = ? AND motion", before)
         shown["detail"] = f"waits for {before}"
-        if other is not None and held_arm(service.state, str(other["arm"])):
+        if other is not None and is_held(service.state, str(other["arm"])):
             shown["detail"] += f", which holds {held_until(other['arm'])}"
     unentered, code = service.engine.live.unentered(row["id"]) if row["state"] == "running" else ("", None)
     if unentered:

@@ -21,7 +21,7 @@ from markupsafe import Markup
 
 from ident_service import __version__
 from ident_service.registry.tokens import Access
-from ident_service.results.plots import number
+from ident_service.results.plots import format_number
 
 _SCRIPTS: Final = ("page", "plots", "live", "again", "upload", "news", "series", "table", "trends", "new", "viewer")
 STATIC: Final = {
@@ -151,7 +151,7 @@ def _figure(value: float | None, digits: int = 3) -> str:
     """Format a number for people, as the report does."""
     if value is None or not math.isfinite(value):
         return "\u2014"
-    return number(value, digits)
+    return format_number(value, digits)
 
 
 def _share(value: float | None, limit: float | None) -> str:
