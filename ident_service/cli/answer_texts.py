@@ -20,7 +20,7 @@ _ASKED: Final = {
 Values = Mapping[str, Any]
 
 
-def told(arguments: argparse.Namespace, document: dict[str, Any], code: int = DONE) -> Answer:
+def answer_of(arguments: argparse.Namespace, document: dict[str, Any], code: int = DONE) -> Answer:
     """Return a verb's answer: (exit code, text that the verb's formatter makes of the document, document)."""
     return code, _TEXTS[arguments.word](document), document
 

@@ -165,11 +165,11 @@ class _Verbs(argparse._SubParsersAction):  # type: ignore[type-arg]
             setattr(namespace, key, value)
 
 
-def did_you_mean(word: str, known: Iterable[str]) -> str:
+def did_you_mean(word: str, known_words: Iterable[str]) -> str:
     """Return `; did you mean X?` for the nearest of the known words; empty where none is near."""
     from difflib import get_close_matches
 
-    near = get_close_matches(str(word), list(known), 1)
+    near = get_close_matches(str(word), list(known_words), 1)
     return f"; did you mean {near[0]}?" if near else ""
 
 
@@ -326,9 +326,9 @@ def add_arm(sub: argparse.ArgumentParser, *, optional: bool = False, motion: boo
         sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help=text)
 
 
-def repeatable(sub: Parser, option: str, metavar: str, text: str, read: Callable[[str], Any] = str) -> None:
-    """Add an option that may be given several times; its value is a list."""
-    sub.add_argument(option, action="append", default=[], type=read, metavar=metavar, help=text)
+def add_repeatable(sub: Parser, option: str, metavar: str, text: str, parse: Callable[[str], Any] = str) -> None:
+    """Add an option that may be given several times; its value is the list of what `parse` makes of each text."""
+    sub.add_argument(option, action="append", default=[], type=parse, metavar=metavar, help=text)
 
 
 def columns_files(given: Sequence[str]) -> tuple[Path | None, dict[Path, Path]]:
@@ -417,6 +417,6 @@ speed = _number("a speed is a share above 0 and at most 1", lambda value: 0.0 < 
 _delay = _number("a delay is a number of seconds below 1, 'estimate' or 'choose'", lambda value: abs(value) < 1, float)
 
 
-def delay(text: str) -> float | str:
+def parse_delay(text: str) -> float | str:
     """Parse a delay [s] below 1 s in magnitude to a float; return `estimate` and `choose` as they are."""
     return text if text in ("estimate", "choose") else _delay(text)

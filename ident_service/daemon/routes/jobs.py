@@ -112,7 +112,7 @@ def create_job(
             rows.enter_key(service.db, who.name, idempotency_key, asked, job["id"])
 
         try:
-            return job_answer_document(service, service.engine.create(body.job, who.name, entering=enter))
+            return job_answer_document(service, service.engine.create(body.job, who.name, also_write=enter))
         except sqlite3.IntegrityError:  # the same request came twice at once, and the other one was entered first
             row = rows.job_of_key(service.db, who.name, idempotency_key, asked)
             if row is None:
@@ -260,22 +260,22 @@ def _named(value: Any, service: Service, row: Row) -> Any:
     return without_paths(value, str(service.state), described if row["arm"] is not None else {})
 
 
-def without_paths(value: Any, state: str, named: Mapping[str, str] = NOTHING) -> Any:
-    """Make paths in all texts of JSON values relative to the state folder; replace those in `named` by their names.
+def without_paths(value: Any, state_folder: str, names_by_path: Mapping[str, str] = NOTHING) -> Any:
+    """Make paths in all texts of JSON values relative to the state folder; replace those in `names_by_path`.
 
     Args:
         value: JSON values.
-        state: the folder.
-        named: texts that replace other paths, by path.
+        state_folder: the folder.
+        names_by_path: texts that replace other paths, by path.
     """
     if isinstance(value, str):
-        for place, name in named.items():
+        for place, name in names_by_path.items():
             value = value.replace(place, name)
-        return value.replace(f" --state {state}", "").replace(f"{state}/", "")
+        return value.replace(f" --state {state_folder}", "").replace(f"{state_folder}/", "")
     if isinstance(value, list):
-        return [without_paths(part, state, named) for part in value]
+        return [without_paths(part, state_folder, names_by_path) for part in value]
     if isinstance(value, dict):
-        return {key: without_paths(part, state, named) for key, part in value.items()}
+        return {key: without_paths(part, state_folder, names_by_path) for key, part in value.items()}
     return value
 
 
