@@ -331,11 +331,11 @@ def add_repeatable(sub: Parser, option: str, metavar: str, text: str, parse: Cal
     sub.add_argument(option, action="append", default=[], type=parse, metavar=metavar, help=text)
 
 
-def columns_files(given: Sequence[str]) -> tuple[Path | None, dict[Path, Path]]:
+def columns_files(option_values: Sequence[str]) -> tuple[Path | None, dict[Path, Path]]:
     """Split `--columns` values into (file for all recordings or None, {recording: its own file}).
 
     Args:
-        given: values of `--columns`, `FILE` or `RECORDING=FILE`.
+        option_values: values of `--columns`, `FILE` or `RECORDING=FILE`.
 
     Returns:
         The file of all, if any, and that of each recording that has its own.
@@ -345,7 +345,7 @@ def columns_files(given: Sequence[str]) -> tuple[Path | None, dict[Path, Path]]:
     """
     of_all: list[Path] = []
     of_one: dict[Path, Path] = {}
-    for words in given:
+    for words in option_values:
         recording, equals, file = words.partition("=")
         if not equals or Path(words).is_file():
             of_all.append(Path(words))
@@ -360,17 +360,17 @@ def columns_files(given: Sequence[str]) -> tuple[Path | None, dict[Path, Path]]:
     return (of_all[0] if of_all else None), of_one
 
 
-def payload_files_of(given: Sequence[str]) -> dict[Path, Path]:
+def payload_files_of(option_values: Sequence[str]) -> dict[Path, Path]:
     """Map each recording to the file of its known payload, from `--payload` values `RECORDING=FILE`.
 
     Args:
-        given: values of `--payload`, `RECORDING=FILE`.
+        option_values: values of `--payload`, `RECORDING=FILE`.
 
     Raises:
         UsageError: no recording or no file in one, or two for one recording.
     """
     found: dict[Path, Path] = {}
-    for words in given:
+    for words in option_values:
         recording, equals, file = words.partition("=")
         if not (recording and equals and file):
             raise UsageError(f"--payload {words}: write RECORDING=FILE, the recording and the file of its known load")

@@ -472,11 +472,11 @@ def typed_name(arguments: argparse.Namespace) -> str:
     return name
 
 
-def confirmation(client: IdentClient, arguments: argparse.Namespace, name: str | None = None) -> dict[str, str]:
+def confirmation(client: IdentClient, arguments: argparse.Namespace, arm_name: str | None = None) -> dict[str, str]:
     """Return a motion's confirmation: the arm's name as a person typed it, and a challenge from the daemon."""
-    name = typed_name(arguments) if name is None else name
+    arm_name = typed_name(arguments) if arm_name is None else arm_name
     word = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/challenge")["challenge"]
-    return {"name": name, "challenge": word}
+    return {"name": arm_name, "challenge": word}
 
 
 def motion_id(client: IdentClient, arm: str, motion: Path | None) -> str | None:

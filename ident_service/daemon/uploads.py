@@ -46,12 +46,12 @@ if TYPE_CHECKING:
 LONGEST_HEADER: Final = 2**20  # bytes
 
 
-def format_of(columns: str, name: str, config: ArmConfig) -> RecordingFormat:
+def format_of(columns_text: str, recording_name: str, config: ArmConfig) -> RecordingFormat:
     """Return the format that a columns file, given as text, describes for a recording of this arm; or raise.
 
     Args:
-        columns: content of the file.
-        name: of the recording.
+        columns_text: content of the file.
+        recording_name: of the recording.
         config: of its arm.
 
     Raises:
@@ -61,8 +61,8 @@ def format_of(columns: str, name: str, config: ArmConfig) -> RecordingFormat:
     from ident_service.operations.recordings import own_formats
 
     with tempfile.TemporaryDirectory(prefix="ident-columns.") as place:
-        file, recording = Path(place) / COLUMNS, Path(name)
-        file.write_text(columns, encoding="utf-8", errors="replace")
+        file, recording = Path(place) / COLUMNS, Path(recording_name)
+        file.write_text(columns_text, encoding="utf-8", errors="replace")
         try:
             return own_formats({recording: file}, [recording], arm_model(config))[recording]
         except ConfigError as error:

@@ -58,18 +58,18 @@ def describe_apart(urdf_file: Path, name: str) -> dict[str, Any]:
     return _answer(urdf_file.name, urdf_file, 3.0 * _DEADLINE, _NEW, name)
 
 
-def draw_apart(description_file: Path, meshes: Path, out: Path) -> None:
+def draw_apart(description_file: Path, mesh_folder: Path, new_folder: Path) -> None:
     """Make triangles of an uploaded arm's meshes in a separate process: `OUT/JOINT.f32`, and `drawn.json` beside them.
 
     Args:
         description_file: the description.
-        meshes: folder of its meshes.
-        out: folder that is made.
+        mesh_folder: folder of its meshes.
+        new_folder: folder that is made.
 
     Raises:
         ModelError: it takes too long or crashes.
     """
-    _answer("the meshes", description_file, 3.0 * _DEADLINE, _DRAW, str(meshes), str(out))
+    _answer("the meshes", description_file, 3.0 * _DEADLINE, _DRAW, str(mesh_folder), str(new_folder))
 
 
 def _answer(what: str, path: Path, deadline: float, *words: str) -> dict[str, Any]:

@@ -76,11 +76,11 @@ def bus_load(config: ArmConfig, rate: float | None = None) -> Budget:
     return found
 
 
-def require_budget(arm: str | Path, config: ArmConfig) -> Budget | None:
+def require_budget(description: str | Path, config: ArmConfig) -> Budget | None:
     """Return the bus budget of an arm with drives on CAN, or None for other arms; raise ConfigError if it does not fit.
 
     Args:
-        arm: file of the description, or name of a shipped one.
+        description: file of the description, or name of a shipped one.
         config: content of the description.
 
     Raises:
@@ -90,7 +90,7 @@ def require_budget(arm: str | Path, config: ArmConfig) -> Budget | None:
         return None
     found = bus_load(config)
     if not found.fits:
-        raise config_error(arm, ("driver",), f"{found.reason}. {found.remedy}")
+        raise config_error(description, ("driver",), f"{found.reason}. {found.remedy}")
     return found
 
 

@@ -83,7 +83,7 @@ class CorrectedFile:
 def check_file(
     parameter_file: Path,
     set_name: FeasibleSetName | None = None,
-    arm: str | None = None,
+    description: str | None = None,
     notation: Notation | None = None,
 ) -> CheckedFile:
     """Test if the base values of a parameter file are those of some point of a feasible set (BPFT, eq. 51).
@@ -91,7 +91,7 @@ def check_file(
     Args:
         parameter_file: the file.
         set_name: feasible set; the file's own when None, or else `pseudo_inertia`.
-        arm: a description whose physical constraints are added; without one, drive inertia, viscous and Coulomb
+        description: a description whose physical constraints are added; without one, drive inertia, viscous and Coulomb
             friction are positive.
         notation: notation of the file's names, where it is not ours.
 
@@ -99,7 +99,7 @@ def check_file(
         UsageError, ConfigError, ParameterError: the file or the arm cannot be used.
         SolverError: the solver stopped without an optimum.
     """
-    file, conditions, notes, _ = _read(parameter_file, set_name, arm, notation)
+    file, conditions, notes, _ = _read(parameter_file, set_name, description, notation)
     certified = file.content.get("feasibility", {}).get("certificate", {}).get("kind") in ("witness", "dual")
     return CheckedFile(conditions.kind, feasibility_test(file.values, file.base, conditions), notes, certified)
 
@@ -108,7 +108,7 @@ def correct_file(
     parameter_file: Path,
     corrected_file: Path,
     set_name: FeasibleSetName | None = None,
-    arm: str | None = None,
+    description: str | None = None,
     metric: Literal["euclidean", "covariance"] = "euclidean",
     notation: Notation | None = None,
 ) -> CorrectedFile:
@@ -120,7 +120,7 @@ def correct_file(
         parameter_file: the file.
         corrected_file: path of the corrected file.
         set_name: feasible set; the file's own when None, or else `pseudo_inertia`.
-        arm: a description whose physical constraints are added, as for `check_file`.
+        description: a description whose physical constraints are added, as for `check_file`.
         metric: metric of the distance: the paper's, in the units of the parameters, or that of the file's covariance,
             which does not depend on the choice of base columns.
         notation: notation of the file's names, where it is not ours; the corrected file has ours.
@@ -130,7 +130,7 @@ def correct_file(
         SolverError: the solver stopped without an optimum.
     """
     require_folder_of(corrected_file)
-    file, conditions, notes, layout = _read(parameter_file, set_name, arm, notation)
+    file, conditions, notes, layout = _read(parameter_file, set_name, description, notation)
     result = feasibility_correction(
         file.values, file.base, conditions, _covariance(parameter_file, file) if metric == "covariance" else None
     ).centred(file.base, conditions)
@@ -203,30 +203,30 @@ DOCUMENT, TEXT, PAGE = "comparison.json", "comparison.txt", "comparison.html"
 KEPT = (DOCUMENT, TEXT, PAGE)
 
 
-def compare_files(paths: Sequence[Path], out: Path | None = None) -> tuple[Comparison, tuple[Path, ...]]:
-    """Compare results with the first of them, into a folder or `.json` if given; return (comparison, files written).
+def compare_files(results: Sequence[Path], written_to: Path | None = None) -> tuple[Comparison, tuple[Path, ...]]:
+    """Compare results with the first; write that to a folder or `.json` if given; return (comparison, files written).
 
     Args:
-        paths: two or more.
-        out: a file that ends in `.json`, or a folder for everything; nothing is written when None.
+        results: parameter files or folders of results, two or more.
+        written_to: a file that ends in `.json`, or a folder for everything; nothing is written when None.
 
     Raises:
-        UsageError: fewer than two, one that is not there, or `out` cannot be written.
+        UsageError: fewer than two, one that is not there, or `written_to` cannot be written.
         ParameterError: one is torn, changed or foreign, or they have nothing in common.
         ConfigError: an arm in a folder is not one that this version reads.
     """
-    one_file = out is not None and out.suffix == ".json" and not out.is_dir()
-    if out is not None and one_file:
-        require_folder_of(out)
-    comparison = compare([read_side(path) for path in paths])
-    if out is None:
+    one_file = written_to is not None and written_to.suffix == ".json" and not written_to.is_dir()
+    if written_to is not None and one_file:
+        require_folder_of(written_to)
+    comparison = compare([read_side(path) for path in results])
+    if written_to is None:
         return comparison, ()
     if one_file:
-        write_comparison(out, comparison)
-        return comparison, (out,)
-    with atomic_folder(out) as staging:
+        write_comparison(written_to, comparison)
+        return comparison, (written_to,)
+    with atomic_folder(written_to) as staging:
         names = write_comparison_files(staging, comparison)
-    return comparison, tuple(out / name for name in names)
+    return comparison, tuple(written_to / name for name in names)
 
 
 def compare_into(reference: Path, folder: Path) -> Comparison:

@@ -181,14 +181,14 @@ class ParameterFile:
 
 
 def read_parameters(
-    path: Path, names: tuple[str, ...] | None = None, notation: Notation | None = None
+    parameter_file: Path, link_parameter_names: tuple[str, ...] | None = None, notation: Notation | None = None
 ) -> ParameterFile:
     """Read a parameter file; check its schema, and that its expressions are independent and name link parameters.
 
     Args:
-        path: the file, or the folder of results that holds it.
-        names: the link parameters of an arm; without them, the ten of every link up to the highest number that the
-            expressions mention, and the joint terms that they mention.
+        parameter_file: the file, or the folder of results that holds it.
+        link_parameter_names: the link parameters of an arm; without them, the ten of every link up to the highest
+            number that the expressions mention, and the joint terms that they mention.
         notation: notation of the file's names, where it is not ours.
 
     Raises:
@@ -196,25 +196,26 @@ def read_parameters(
         ParameterError: not JSON, not of the schema, a name that is no link parameter, or expressions that do not parse
             or depend on each other.
     """
-    if path.is_dir():
-        path = path / "parameters.json"
-    if not path.is_file():
-        raise UsageError(f"no such file: {path}")
-    if path.stat().st_size > MAX_BYTES:
-        raise ParameterError(f"{path}: larger than {MAX_BYTES} bytes")
+    if parameter_file.is_dir():
+        parameter_file = parameter_file / "parameters.json"
+    if not parameter_file.is_file():
+        raise UsageError(f"no such file: {parameter_file}")
+    if parameter_file.stat().st_size > MAX_BYTES:
+        raise ParameterError(f"{parameter_file}: larger than {MAX_BYTES} bytes")
     try:
-        content = strict_json(path.read_text(encoding="utf-8"))
+        content = strict_json(parameter_file.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
-        raise ParameterError(f"{path}: not JSON: {error}") from None
-    _require_document(content, path)
+        raise ParameterError(f"{parameter_file}: not JSON: {error}") from None
+    _require_document(content, parameter_file)
     table = content["base_parameters"]
     expressions, values = tuple(table["expressions"]), np.array(table["values"], dtype=float)
     for key, column in table.items():
         if len(column) != len(expressions):
-            raise ParameterError(f"{path}: {len(expressions)} expressions but {len(column)} {key}")
+            raise ParameterError(f"{parameter_file}: {len(expressions)} expressions but {len(column)} {key}")
     if len(expressions) > MOST_EXPRESSIONS or sum(map(len, expressions)) > MOST_CHARACTERS:
         raise ParameterError(
-            f"{path}: more than {MOST_EXPRESSIONS} expressions, or more than {MOST_CHARACTERS} characters in them"
+            f"{parameter_file}: more than {MOST_EXPRESSIONS} expressions, or more than {MOST_CHARACTERS} characters in "
+            "them"
         )
     notes: tuple[str, ...] = ()
     try:
@@ -226,9 +227,9 @@ def read_parameters(
                 printed = content["link_parameters"]
                 printed["names"] = [translate(name, notation) for name in printed["names"]]
         mentioned = _names_in(expressions, content.get("link_parameters", {}).get("names", ()))
-        base = base_from_expressions(expressions, mentioned if names is None else names)
+        base = base_from_expressions(expressions, mentioned if link_parameter_names is None else link_parameter_names)
     except ParameterError as error:
-        raise ParameterError(f"{path}: {error}") from None
+        raise ParameterError(f"{parameter_file}: {error}") from None
     return ParameterFile(base, values, content.get("feasible_set"), content, notes)
 
 
@@ -491,19 +492,19 @@ def named_link_values(file: ParameterFile) -> dict[str, float] | None:
     return {name: float(value) for name, value in zip(table["names"], table["values"], strict=True)}
 
 
-def require_base_values(base: BaseParameters, delta: Array, values: Array, where: Path) -> None:
+def require_base_values(base: BaseParameters, delta: Array, base_values: Array, origin: Path) -> None:
     """Raise ParameterError unless the link values have the base values.
 
     Args:
         base: the grouping.
         delta: link values in its order, shape (parameters,).
-        values: base values, shape (base,).
-        where: origin of the values, for errors.
+        base_values: base values, shape (base,).
+        origin: origin of the values, for errors.
 
     Raises:
         ParameterError: they do not.
     """
-    if np.abs(base.K @ delta - values).max() > AGREEMENT * np.abs(values).max():
+    if np.abs(base.K @ delta - base_values).max() > AGREEMENT * np.abs(base_values).max():
         raise ParameterError(
-            f"{where}: its link parameters do not have the values of its base parameters; one of them was changed"
+            f"{origin}: its link parameters do not have the values of its base parameters; one of them was changed"
         )

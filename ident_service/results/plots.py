@@ -319,11 +319,11 @@ def visible_samples(time: Array, values: Array, pixel_columns: int) -> NDArray[n
     return np.unique(np.concatenate([[0], order[begins], order[ends], [len(time) - 1]]))
 
 
-def require_drawable(name: str, values: Array, shape: tuple[int, ...], *, unlimited: bool = False) -> None:
+def require_drawable(quantity: str, values: Array, shape: tuple[int, ...], *, unlimited: bool = False) -> None:
     """Raise UsageError for values that cannot be drawn: empty, of another shape, NaN, infinite or huge.
 
     Args:
-        name: name of the values, for the message.
+        quantity: name of the values, for the message.
         values: values to be drawn.
         shape: required shape.
         unlimited: whether infinities may stand for limits that are not there.
@@ -332,13 +332,13 @@ def require_drawable(name: str, values: Array, shape: tuple[int, ...], *, unlimi
         UsageError: nothing in it, another shape, or values that are NaN or (where not `unlimited`) infinite or huge.
     """
     if values.shape != shape:
-        raise UsageError(f"cannot draw {name}: its shape is {values.shape}, not {shape}")
+        raise UsageError(f"cannot draw {quantity}: its shape is {values.shape}, not {shape}")
     if values.size == 0:
-        raise UsageError(f"cannot draw {name}: it is empty")
+        raise UsageError(f"cannot draw {quantity}: it is empty")
     bad = np.isnan(values) | (np.zeros(shape, bool) if unlimited else ~(np.abs(values) < LARGEST))
     if bad.any():
         first = tuple(int(k) for k in np.argwhere(bad)[0])
-        raise UsageError(f"cannot draw {name}: the value at {list(first)} is {values[first]}")
+        raise UsageError(f"cannot draw {quantity}: the value at {list(first)} is {values[first]}")
 
 
 FONT = 12.0

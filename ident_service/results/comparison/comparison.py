@@ -173,7 +173,7 @@ class ComparedSet:
         )
 
 
-def read_side(path: Path) -> ComparedSet:
+def read_side(results_path: Path) -> ComparedSet:
     """Read and check a folder of results or a parameter file, to be compared.
 
     Raises:
@@ -181,13 +181,13 @@ def read_side(path: Path) -> ComparedSet:
         ParameterError: torn, changed or foreign, or values that contradict each other.
         ConfigError: the folder's arm is not one that this version reads.
     """
-    if path.is_dir():
-        results = read_results(path)
-        require_consistent(results.parameters, path / PARAMETERS)
-        return ComparedSet(path, results.sha256[PARAMETERS], results.parameters, results.config)
-    file = read_parameters(path)
-    require_consistent(file, path)
-    return ComparedSet(path, hashlib.sha256(path.read_bytes()).hexdigest(), file)
+    if results_path.is_dir():
+        results = read_results(results_path)
+        require_consistent(results.parameters, results_path / PARAMETERS)
+        return ComparedSet(results_path, results.sha256[PARAMETERS], results.parameters, results.config)
+    file = read_parameters(results_path)
+    require_consistent(file, results_path)
+    return ComparedSet(results_path, hashlib.sha256(results_path.read_bytes()).hexdigest(), file)
 
 
 @dataclass(frozen=True)

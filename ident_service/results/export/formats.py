@@ -281,13 +281,13 @@ FORMATS: dict[str, Callable[[IdentifiedArm], Export]] = {
 }
 
 
-def known_formats(words: str) -> tuple[str, ...]:
+def known_formats(format_list: str) -> tuple[str, ...]:
     """Parse the names of formats in a list with commas, each once; raise UsageError for unknown ones or none.
 
     Raises:
         UsageError: none, or one that is not there.
     """
-    named = tuple(dict.fromkeys(word.strip() for word in words.split(",") if word.strip()))
+    named = tuple(dict.fromkeys(word.strip() for word in format_list.split(",") if word.strip()))
     if unknown := [word for word in named if word not in FORMATS]:
         raise UsageError(f"no export format {', '.join(map(repr, unknown))}: formats are {', '.join(FORMATS)}")
     if not named:

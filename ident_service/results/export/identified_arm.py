@@ -96,13 +96,15 @@ class IdentifiedArm:
         return self.delta
 
 
-def identified_arm(config: ArmConfig, parameters: ParameterFile, source: str, parameter_path: Path) -> IdentifiedArm:
+def identified_arm(
+    config: ArmConfig, parameters: ParameterFile, parameters_sha256: str, parameter_path: Path
+) -> IdentifiedArm:
     """Check that a parameter file is of an arm and consistent, and combine the two.
 
     Args:
         config: the arm, its friction's shape as identified.
         parameters: of that arm.
-        source: SHA-256 of the parameter file.
+        parameters_sha256: SHA-256 of the parameter file.
         parameter_path: the parameter file, for errors.
 
     Raises:
@@ -132,7 +134,7 @@ def identified_arm(config: ArmConfig, parameters: ParameterFile, source: str, pa
         delta=_link_values(parameters, base, parameter_path),
         sigma=tuple(sigma or [None] * base.size),
         verdicts=tuple(verdicts or [""] * base.size),
-        source=source,
+        source=parameters_sha256,
         feasible_set=parameters.feasible_set or "none",
         unconstrained=None if (free := table.get("unconstrained_values")) is None else np.array(free, dtype=float),
         motion=None if known is None else _motion(parameters.content, base, model, parameter_path),

@@ -54,19 +54,19 @@ def torque(model: ArmModel, delta: Array, states: States) -> Array:
     return np.asarray(np.einsum("jps,p->sj", joint_regressor(model.chain, model.layout, *states), delta))
 
 
-def with_terms(model: ArmModel, delta: Array, terms: Collection[JointTerm]) -> Array:
-    """Return a copy of the parameters in which the joint terms in `terms` are kept and all others are zero."""
+def with_terms(model: ArmModel, delta: Array, kept_terms: Collection[JointTerm]) -> Array:
+    """Return a copy of the link parameters in which the joint terms outside `kept_terms` are zero."""
     kept, layout = np.array(delta, dtype=float), model.layout
     for term in layout.terms:
-        if term not in terms:
+        if term not in kept_terms:
             kept[layout.term_columns(term)] = 0.0
     return kept
 
 
-def supported_terms(model: ArmModel, delta: Array, terms: Collection[JointTerm]) -> Carried:
+def supported_terms(model: ArmModel, delta: Array, format_terms: Collection[JointTerm]) -> Carried:
     """Map each joint term of a format to a mask of the joints whose value it can hold: not negative, with own drive."""
     drives = joint_drives(model.chain, model.layout, delta)
-    known = [term for term in JOINT_TERMS if term in terms and term in model.layout.terms]
+    known = [term for term in JOINT_TERMS if term in format_terms and term in model.layout.terms]
     return {term: drives.own & (drives.of(term) >= 0.0) for term in known}
 
 
@@ -149,9 +149,9 @@ class RecordedMotion:
         ]
         return np.asarray(np.sqrt(np.array(sums) / np.maximum(self.rows, 1.0)))
 
-    def in_words(self, model: ArmModel, delta: Array) -> str:
-        """Describe the torque of `delta`, parameters that are lost, at each joint where it counts, largest first."""
-        torques = self.torque(delta)
+    def in_words(self, model: ArmModel, lost_delta: Array) -> str:
+        """Describe the torque of link parameters that are lost, at each joint where it counts, the largest first."""
+        torques = self.torque(lost_delta)
         own = np.sqrt(self.information.squared_torques() / np.maximum(self.rows, 1.0))
         told = torques > _TOLD * own
         units = ["N m" if turns else "N" for turns in model.chain.revolute]

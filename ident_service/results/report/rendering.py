@@ -101,9 +101,9 @@ def render(template: str, scripts: Sequence[str] = (), styles: Sequence[str] = (
 
 
 @cache
-def asset(name: str) -> str:
+def asset(file_name: str) -> str:
     """Return the text of a file of this package."""
-    return files(str(__package__)).joinpath(name).read_text(encoding="utf-8")
+    return files(str(__package__)).joinpath(file_name).read_text(encoding="utf-8")
 
 
 @cache
