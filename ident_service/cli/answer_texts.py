@@ -20,7 +20,7 @@ _ASKED: Final = {
 Values = Mapping[str, Any]
 
 
-def told(arguments: argparse.Namespace, document: dict[str, Any], code: int = DONE) -> Answer:
+def answer_of(arguments: argparse.Namespace, document: dict[str, Any], code: int = DONE) -> Answer:
     """Return a verb's answer: (exit code, text that the verb's formatter makes of the document, document)."""
     return code, _TEXTS[arguments.word](document), document
 
@@ -33,15 +33,15 @@ def stop_text(arm: str | None, reached: Sequence[str], cancelled: Sequence[str] 
     return f"{'; '.join(parts) or f'{nobody}; motions requested before now will not begin'}\n"
 
 
-def asked_text(arm: str, asked: str) -> str:
+def asked_text(arm: str, request: str) -> str:
     """Format the line that confirms a request to a moving arm's process: `pause`, `resume`, `finish` or `supported`."""
-    return f"{arm}: {_ASKED[asked]}\n"
+    return f"{arm}: {_ASKED[request]}\n"
 
 
-def reidentified_text(comparison: str, state: str, words: str) -> str:
-    """Join a comparison's text and the verdict's words; if `state` is `changed`, add that an alarm is open."""
+def reidentified_text(comparison: str, verdict_state: str, verdict_words: str) -> str:
+    """Join a comparison's text and the verdict's words; if `verdict_state` is `changed`, add that an alarm is open."""
     opened = "a drift alarm is open until `ident alarms acknowledge`, or `ident accept` of another set\n"
-    return f"{comparison}{words}\n{opened if state == 'changed' else ''}"
+    return f"{comparison}{verdict_words}\n{opened if verdict_state == 'changed' else ''}"
 
 
 def _list(name: str, line: Callable[[Values], str], none: str) -> Callable[[Values], str]:

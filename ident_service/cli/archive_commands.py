@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.answer_texts import told
+from ident_service.cli.answer_texts import answer_of
 from ident_service.cli.arguments import Parser, VerbList, count
 from ident_service.cli.output import DONE, Answer, print_to_person, state_folder, writable_state_folder
 from ident_service.errors import IdentError, InUse, UsageError
@@ -70,15 +70,15 @@ def registry(arguments: argparse.Namespace, *, arms: bool = True) -> Iterator[tu
         yield db, state
 
 
-def write_audit_entry(arguments: argparse.Namespace, what: str, about: str, **detail: Any) -> None:
+def write_audit_entry(arguments: argparse.Namespace, action: str, subject: str, **detail: Any) -> None:
     """Write to the audit trail what was done at a terminal, or queue it if that fails; nothing without a registry.
 
     It has been done already: a registry that is kept or full changes nothing, and the line is entered later.
 
     Args:
         arguments: of the verb.
-        what: one word or two that name the act, as in the daemon's own lines.
-        about: name of the arm.
+        action: one word or two that name the act, as in the daemon's own lines.
+        subject: name of the arm.
         detail: JSON values.
     """
     import sqlite3
@@ -92,12 +92,12 @@ def write_audit_entry(arguments: argparse.Namespace, what: str, about: str, **de
         try:
             with Database(state, busy=_PATIENCE) as db:
                 write_deferred_entries(db, state)
-                note(db, terminal_user(arguments), what, about, **detail)
+                note(db, terminal_user(arguments), action, subject, **detail)
         except sqlite3.Error as error:
             raise registry_error(state / FILE, error) from None
     except (IdentError, OSError) as error:
         try:
-            note_later(state, terminal_user(arguments), what, about, **detail)
+            note_later(state, terminal_user(arguments), action, subject, **detail)
         except (IdentError, OSError) as refusal:
             print_to_person(f"ident: done, but not entered in the audit trail: {error}; {refusal}\n")
         else:
@@ -208,7 +208,7 @@ def _arms(arguments: argparse.Namespace) -> Answer:
         rows = [{key: row[key] for key in ("name", "source", "description")} for row in arm_names(db)]
     named = {row["name"] for row in rows}
     rows += [{"name": name, "source": "file", "description": ""} for name in known_arms(state) if name not in named]
-    return told(arguments, {"arms": rows})
+    return answer_of(arguments, {"arms": rows})
 
 
 def _runs(arguments: argparse.Namespace) -> Answer:
@@ -217,7 +217,7 @@ def _runs(arguments: argparse.Namespace) -> Answer:
     with registry(arguments) as (db, state):
         unreadable = rebuild_runs(db, state)
         rows = [{key: row[key] for key in _RUN_KEYS} for row in runs(db, arguments.arm, most=arguments.most)]
-    return told(arguments, {"runs": rows, "not_listed": unreadable})
+    return answer_of(arguments, {"runs": rows, "not_listed": unreadable})
 
 
 def _motions(arguments: argparse.Namespace) -> Answer:
@@ -225,7 +225,7 @@ def _motions(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as (db, _):
         rows = [dict(row) for row in motions(db, arguments.arm, most=arguments.most)]
-    return told(arguments, {"motions": rows})
+    return answer_of(arguments, {"motions": rows})
 
 
 def _accept(arguments: argparse.Namespace) -> Answer:
@@ -233,7 +233,7 @@ def _accept(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as (db, state):
         act = accept(db, state, arguments.run.resolve(), arguments.note, terminal_user(arguments))
-    return told(arguments, {**asdict(act), "current": str(current_file(state, act.arm))})
+    return answer_of(arguments, {**asdict(act), "current": str(current_file(state, act.arm))})
 
 
 def _rollback(arguments: argparse.Namespace) -> Answer:
@@ -241,7 +241,7 @@ def _rollback(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as (db, state):
         act = rollback(db, state, arguments.arm, arguments.note, terminal_user(arguments), arguments.to)
-    return told(arguments, {**asdict(act), "current": str(current_file(state, act.arm))})
+    return answer_of(arguments, {**asdict(act), "current": str(current_file(state, act.arm))})
 
 
 def _import(arguments: argparse.Namespace) -> Answer:
@@ -272,7 +272,7 @@ def _prune(arguments: argparse.Namespace) -> Answer:
         "recordings": [asdict(one) for one in gone],
         "left_alone": untold,
     }
-    return told(arguments, document)
+    return answer_of(arguments, document)
 
 
 def _delete(arguments: argparse.Namespace) -> Answer:
@@ -282,7 +282,7 @@ def _delete(arguments: argparse.Namespace) -> Answer:
     delete = {"run": deletion.delete_run, "motion": deletion.delete_motion, "arm": deletion.delete_arm}[kind]
     with registry(arguments) as (db, state), hint_at_anyway(kind, arguments.name):
         found = delete(db, state, arguments.name, terminal_user(arguments), anyway=arguments.anyway)
-    return told(arguments, {"deleted": arguments.name, "dependents": [asdict(one) for one in found]})
+    return answer_of(arguments, {"deleted": arguments.name, "dependents": [asdict(one) for one in found]})
 
 
 @contextmanager

@@ -165,11 +165,11 @@ class _Verbs(argparse._SubParsersAction):  # type: ignore[type-arg]
             setattr(namespace, key, value)
 
 
-def did_you_mean(word: str, known: Iterable[str]) -> str:
+def did_you_mean(word: str, known_words: Iterable[str]) -> str:
     """Return `; did you mean X?` for the nearest of the known words; empty where none is near."""
     from difflib import get_close_matches
 
-    near = get_close_matches(str(word), list(known), 1)
+    near = get_close_matches(str(word), list(known_words), 1)
     return f"; did you mean {near[0]}?" if near else ""
 
 
@@ -326,16 +326,16 @@ def add_arm(sub: argparse.ArgumentParser, *, optional: bool = False, motion: boo
         sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help=text)
 
 
-def repeatable(sub: Parser, option: str, metavar: str, text: str, read: Callable[[str], Any] = str) -> None:
-    """Add an option that may be given several times; its value is a list."""
-    sub.add_argument(option, action="append", default=[], type=read, metavar=metavar, help=text)
+def add_repeatable(sub: Parser, option: str, metavar: str, text: str, parse: Callable[[str], Any] = str) -> None:
+    """Add an option that may be given several times; its value is the list of what `parse` makes of each text."""
+    sub.add_argument(option, action="append", default=[], type=parse, metavar=metavar, help=text)
 
 
-def columns_files(given: Sequence[str]) -> tuple[Path | None, dict[Path, Path]]:
+def columns_files(option_values: Sequence[str]) -> tuple[Path | None, dict[Path, Path]]:
     """Split `--columns` values into (file for all recordings or None, {recording: its own file}).
 
     Args:
-        given: values of `--columns`, `FILE` or `RECORDING=FILE`.
+        option_values: values of `--columns`, `FILE` or `RECORDING=FILE`.
 
     Returns:
         The file of all, if any, and that of each recording that has its own.
@@ -345,7 +345,7 @@ def columns_files(given: Sequence[str]) -> tuple[Path | None, dict[Path, Path]]:
     """
     of_all: list[Path] = []
     of_one: dict[Path, Path] = {}
-    for words in given:
+    for words in option_values:
         recording, equals, file = words.partition("=")
         if not equals or Path(words).is_file():
             of_all.append(Path(words))
@@ -360,17 +360,17 @@ def columns_files(given: Sequence[str]) -> tuple[Path | None, dict[Path, Path]]:
     return (of_all[0] if of_all else None), of_one
 
 
-def payload_files_of(given: Sequence[str]) -> dict[Path, Path]:
+def payload_files_of(option_values: Sequence[str]) -> dict[Path, Path]:
     """Map each recording to the file of its known payload, from `--payload` values `RECORDING=FILE`.
 
     Args:
-        given: values of `--payload`, `RECORDING=FILE`.
+        option_values: values of `--payload`, `RECORDING=FILE`.
 
     Raises:
         UsageError: no recording or no file in one, or two for one recording.
     """
     found: dict[Path, Path] = {}
-    for words in given:
+    for words in option_values:
         recording, equals, file = words.partition("=")
         if not (recording and equals and file):
             raise UsageError(f"--payload {words}: write RECORDING=FILE, the recording and the file of its known load")
@@ -417,6 +417,6 @@ speed = _number("a speed is a share above 0 and at most 1", lambda value: 0.0 < 
 _delay = _number("a delay is a number of seconds below 1, 'estimate' or 'choose'", lambda value: abs(value) < 1, float)
 
 
-def delay(text: str) -> float | str:
+def parse_delay(text: str) -> float | str:
     """Parse a delay [s] below 1 s in magnitude to a float; return `estimate` and `choose` as they are."""
     return text if text in ("estimate", "choose") else _delay(text)

@@ -26,7 +26,7 @@ _JOBS, _UPLOADED = "SELECT id FROM jobs ORDER BY number DESC LIMIT 50", "SELECT 
 
 
 def install_completion(shell: str, *, install: bool) -> tuple[str, Path | None]:
-    """Return (completion script for a shell, file that it was written to); None for the file without `install`.
+    """Return (completion script for bash, zsh or fish, file that it was written to if `install`, else None).
 
     Args:
         shell: `bash`, `zsh` or `fish`.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ident_service.cli.answer_texts import told
+from ident_service.cli.answer_texts import answer_of
 from ident_service.cli.archive_commands import add_by, registry, terminal_user
 from ident_service.cli.arguments import VerbList
 from ident_service.cli.completion import SHELLS, install_completion
@@ -110,7 +110,7 @@ def _list(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments, arms=False) as (db, _):
         rows = tokens(db)
-    return told(arguments, {"tokens": [dict(row) for row in rows]})
+    return answer_of(arguments, {"tokens": [dict(row) for row in rows]})
 
 
 def _revoke(arguments: argparse.Namespace) -> Answer:
@@ -118,7 +118,7 @@ def _revoke(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments, arms=False) as (db, _):
         revoke_token(db, arguments.name, terminal_user(arguments))
-    return told(arguments, {"name": arguments.name, "revoked": True})
+    return answer_of(arguments, {"name": arguments.name, "revoked": True})
 
 
 def _port(text: str) -> int:

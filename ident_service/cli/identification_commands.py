@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Any
 from ident_service.cli.arguments import (
     FEASIBLE_SETS,
     VerbList,
+    add_repeatable,
     columns_files,
-    delay,
     did_you_mean,
+    parse_delay,
     payload_files_of,
-    repeatable,
     replicates,
     seed,
     weight,
@@ -84,11 +84,11 @@ def _add_commission(verbs: VerbList) -> None:
         "recordings", nargs="+", type=Path, metavar="RECORDING", help="MCAP or CSV; FILE@41:60 reads 41 s to 60 s of it"
     )
     sub.add_argument("--arm", required=True, metavar="ARM", help="description file, or the name of a shipped one")
-    repeatable(sub, "--validate", "RECORDING", "validate on this recording; may be repeated", Path)
+    add_repeatable(sub, "--validate", "RECORDING", "validate on this recording; may be repeated", Path)
     columns = "YAML file with column names and units, for all recordings or one; may be repeated"
-    repeatable(sub, "--columns", "[RECORDING=]FILE", columns)
+    add_repeatable(sub, "--columns", "[RECORDING=]FILE", columns)
     payload = "YAML file with mass and center_of_mass of the known load in a recording; may be repeated"
-    repeatable(sub, "--payload", "RECORDING=FILE", payload)
+    add_repeatable(sub, "--payload", "RECORDING=FILE", payload)
     sub.add_argument(
         "--torque-constants",
         action="store_true",
@@ -101,7 +101,7 @@ def _add_commission(verbs: VerbList) -> None:
     sub.add_argument("--prior", choices=["none", "euclidean", "entropic"], help="regularise towards the arm's prior")
     sub.add_argument("--prior-weight", type=weight, metavar="W", help="default: chosen on held-out data")
     sub.add_argument(
-        "--delay", type=delay, metavar="SECONDS", help="delay of the torque stamps [s], 'estimate' or 'choose'"
+        "--delay", type=parse_delay, metavar="SECONDS", help="delay of the torque stamps [s], 'estimate' or 'choose'"
     )
     sub.add_argument(
         "--bootstrap",
@@ -740,7 +740,7 @@ def _add_results(verbs: VerbList) -> None:
         examples=("result", "result --save result.rrd"),
     )
     sub.add_argument("run", type=Path, metavar="RUN", help="run folder of `run`, `simulate` or `identify`")
-    repeatable(sub, "--recording", "FILE", "besides those in the folder; may be repeated", Path)
+    add_repeatable(sub, "--recording", "FILE", "besides those in the folder; may be repeated", Path)
     sub.add_argument("--urdf", type=Path, metavar="FILE", help="draw its meshes, which stand beside it")
     sub.add_argument("--save", type=Path, metavar="FILE.rrd", help="write a file for Rerun instead of opening it")
 
@@ -764,9 +764,9 @@ def _figures(arguments: argparse.Namespace) -> Answer:
 
 
 def _view(arguments: argparse.Namespace) -> Answer:
-    from ident_service.operations.run_view import view_run
+    from ident_service.operations.run_view import show_run_in_viewer
 
-    seen = view_run(arguments.run, arguments.recording, arguments.save, arguments.urdf)
+    seen = show_run_in_viewer(arguments.run, arguments.recording, arguments.save, arguments.urdf)
     text = f"recordings: {', '.join(seen.recordings)}\n"
     text += f"residuals: {', '.join(seen.residuals) or 'none; identify parameters from the recording first'}\n"
     if seen.saved is not None:

@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.answer_texts import told
+from ident_service.cli.answer_texts import answer_of
 from ident_service.cli.archive_commands import add_by, registry, terminal_user
 from ident_service.cli.arguments import Parser, VerbList, count, hours
 from ident_service.cli.output import DONE, VERDICT_NO, Answer
@@ -119,7 +119,7 @@ def _add(arguments: argparse.Namespace) -> Answer:
     with registry(arguments) as (db, state):
         name = _known(db, state, arguments)
         row = add_schedule(db, name, when, terminal_user(arguments), time.time(), arguments.motion)
-    return told(arguments, _shown(row))
+    return answer_of(arguments, _shown(row))
 
 
 def _list(arguments: argparse.Namespace) -> Answer:
@@ -127,7 +127,7 @@ def _list(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as (db, _):
         rows = schedules(db, arguments.arm)
-    return told(arguments, {"schedules": [_shown(row) for row in rows]})
+    return answer_of(arguments, {"schedules": [_shown(row) for row in rows]})
 
 
 def _remove(arguments: argparse.Namespace) -> Answer:
@@ -135,7 +135,7 @@ def _remove(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as (db, _):
         remove_schedule(db, arguments.number, terminal_user(arguments))
-    return told(arguments, {"id": arguments.number, "removed": True})
+    return answer_of(arguments, {"id": arguments.number, "removed": True})
 
 
 def _enabled(arguments: argparse.Namespace) -> Answer:
@@ -143,7 +143,7 @@ def _enabled(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as (db, _):
         row = enable_schedule(db, arguments.number, terminal_user(arguments), time.time(), enabled=arguments.enabled)
-    return told(arguments, _shown(row))
+    return answer_of(arguments, _shown(row))
 
 
 def _maintenance(arguments: argparse.Namespace) -> Answer:
@@ -153,14 +153,14 @@ def _maintenance(arguments: argparse.Namespace) -> Answer:
         name = _known(db, state, arguments)
         row = add_event(db, name, arguments.what, arguments.note, terminal_user(arguments), time.time())
         due = pending_with_accepted(db, state, name)
-    return told(arguments, {**row, "due": due})
+    return answer_of(arguments, {**row, "due": due})
 
 
 def _due(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.maintenance_schedule import pending_with_accepted
 
     with registry(arguments) as (db, state):
-        return told(arguments, {"due": pending_with_accepted(db, state, arguments.arm)})
+        return answer_of(arguments, {"due": pending_with_accepted(db, state, arguments.arm)})
 
 
 def _dismiss(arguments: argparse.Namespace) -> Answer:
@@ -168,7 +168,7 @@ def _dismiss(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as (db, _):
         dismiss(db, arguments.number, arguments.note, terminal_user(arguments), time.time())
-    return told(arguments, {"id": arguments.number, "dismissed": True})
+    return answer_of(arguments, {"id": arguments.number, "dismissed": True})
 
 
 def _alarms(arguments: argparse.Namespace) -> Answer:
@@ -176,7 +176,7 @@ def _alarms(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as (db, _):
         rows = alarms(db, arguments.arm)
-    return told(arguments, {"alarms": [dict(row) for row in rows]}, VERDICT_NO if rows else DONE)
+    return answer_of(arguments, {"alarms": [dict(row) for row in rows]}, VERDICT_NO if rows else DONE)
 
 
 def _ack(arguments: argparse.Namespace) -> Answer:
@@ -184,7 +184,7 @@ def _ack(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as (db, _):
         row = acknowledge_alarm(db, arguments.number, arguments.note, terminal_user(arguments), time.time())
-    return told(arguments, dict(row))
+    return answer_of(arguments, dict(row))
 
 
 def _shown(row: Row) -> dict[str, Any]:

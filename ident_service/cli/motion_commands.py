@@ -37,7 +37,7 @@ from ident_service.cli.output import (
     tell,
     writable_state_folder,
 )
-from ident_service.cli.progress import ask, step_of, typed
+from ident_service.cli.progress import ask, step_of, typed_confirmation
 from ident_service.errors import DriverError, IdentError, MotionRefused, UsageError
 
 if TYPE_CHECKING:
@@ -96,10 +96,10 @@ class HeldKey:
         self._look()
         return self._released
 
-    def wait(self, given_up: Callable[[], bool], seconds: float = 0.02) -> bool:
-        """Wait until the key is held; return False once it was released, the terminal is gone or `given_up` says so."""
+    def wait(self, stop_requested: Callable[[], bool], seconds: float = 0.02) -> bool:
+        """Wait until the key is held; return False once it is released, the terminal is gone or a stop is requested."""
         while not self.held():
-            if self._released or given_up():
+            if self._released or stop_requested():
                 return False
             select.select([self._fd], [], [], seconds)
         return True
@@ -136,12 +136,12 @@ def run_and_report(
     arguments: argparse.Namespace,
     config: ArmConfig,
     motion: Excitation | Destination,
-    sentence: str,
+    announcement: str,
     *,
     speed: float = 1.0,
-    lease: float | None = None,
+    lease_seconds: float | None = None,
     stop_requested: Callable[[], bool],
-    until: Target | None = None,
+    target: Target | None = None,
 ) -> Answer:
     """Run a motion, or go to a destination, by the arm's preflight ticket; record it and return the verb's answer.
 
@@ -149,11 +149,11 @@ def run_and_report(
         arguments: arguments of the verb, with `out`, `state` and `can_log`.
         config: of the arm.
         motion: motion or destination.
-        sentence: description of the motion, printed with the folder before it begins.
+        announcement: description of the motion, printed with the folder before it begins.
         speed: share of the motion's own.
-        lease: how long the arm moves on when this process is gone [s]; None for the ordinary one.
+        lease_seconds: how long the arm moves on when this process is gone [s]; None for the ordinary one.
         stop_requested: function that is called several times per lease; True stops the motion.
-        until: accuracy target at which the run is finished early.
+        target: accuracy target at which the run is finished early.
 
     Raises:
         IdentError: as `run_motion`; MotionRefused without a ticket.
@@ -174,7 +174,7 @@ def run_and_report(
     def begin() -> None:
         nonlocal begun
         begun = True
-        tell(arguments, f"{config.name}: {sentence}, into {folder}")
+        tell(arguments, f"{config.name}: {announcement}, into {folder}")
 
     step, words, reached = step_of(arguments), "preparing the motion", 0.0
     whole = motion.duration / speed if isinstance(motion, Excitation) else None
@@ -198,14 +198,14 @@ def run_and_report(
             state,
             read_ticket(path),
             speed=speed,
-            lease=LEASE_SECONDS if lease is None else lease,
+            lease_seconds=LEASE_SECONDS if lease_seconds is None else lease_seconds,
             log_frames=arguments.can_log,
-            begin=begin,
+            on_begin=begin,
             requested_ns=arguments.requested_ns,
             tell=entered,
-            moved=moved,
+            on_progress=moved,
             stop_requested=stop_requested,
-            until=until,
+            target=target,
         )
     except IdentError as error:
         if begun and folder.exists():
@@ -473,7 +473,7 @@ def _watch(arguments: argparse.Namespace) -> Answer:
     if (pid := controlling_pid(control_path(state_folder(arguments), config.name))) is not None:
         raise DriverError(f"{config.name}: process {pid} is moving the arm; see its recording")
     stopping = StopOnSignal()
-    step_of(arguments)("watching", left=arguments.seconds)
+    step_of(arguments)("watching", seconds_left=arguments.seconds)
     with stopping:
         if arguments.tell_samples:
             print(f"reading for {arguments.seconds:g} s, without torque", file=sys.stderr, flush=True)
@@ -537,7 +537,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
                 stoppable,
                 model,
                 motion,
-                confirm=partial(typed, arguments),
+                confirm=partial(typed_confirmation, arguments),
                 tell=lambda check: step(*_PREFLIGHT.get(check.code, ("checking", None))),
                 rate_seconds=seconds,
                 closed=closed,
@@ -591,9 +591,9 @@ def _move(arguments: argparse.Namespace, share_of_speed: float, seconds: float |
             motion,
             sentence,
             speed=share_of_speed,
-            lease=seconds,
+            lease_seconds=seconds,
             stop_requested=stop_or_lapsed(stopping.requested, lease),
-            until=_target(arguments),
+            target=_target(arguments),
         )
 
 
@@ -638,7 +638,7 @@ def _hold_to_run(arguments: argparse.Namespace, share_of_speed: float) -> Answer
             motion,
             sentence,
             speed=share_of_speed,
-            lease=HOLD_TO_RUN_SECONDS,
+            lease_seconds=HOLD_TO_RUN_SECONDS,
             stop_requested=lambda: stopping.requested() or key.released(),
         )
 
@@ -701,7 +701,10 @@ def _require_typed(arguments: argparse.Namespace, name: str, follows: str) -> No
     Raises:
         UsageError: another word, or nobody to ask.
     """
-    if typed(arguments, f"{name} {follows}. If it is supported and nobody is under it, type its name:") != name:
+    if (
+        typed_confirmation(arguments, f"{name} {follows}. If it is supported and nobody is under it, type its name:")
+        != name
+    ):
         raise UsageError(f"confirm that the arm is supported by its name: --confirm {name}; nothing has changed")
 
 

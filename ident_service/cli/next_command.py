@@ -89,7 +89,7 @@ def next_line(arguments: argparse.Namespace, code: int, document: Mapping[str, A
         words = None if follows is None else follows(ended)
     except (LookupError, AttributeError, TypeError):  # an answer of another version; what is done stays done
         words = None
-    return "" if words is None else f"next: {command(arguments, words)}\n"
+    return "" if words is None else f"next: {shell_line(arguments, words)}\n"
 
 
 def _job_refusal(arguments: argparse.Namespace, said: Mapping[str, Any]) -> str:
@@ -105,20 +105,20 @@ def next_after_error(arguments: argparse.Namespace, kind: type[IdentError], mess
     """Return the line `next: ident ...`, the command that clears a fault or refusal; empty for other errors."""
     arm = getattr(arguments, "arm", None)
     if arguments.word == "reidentify" and "nothing has been accepted" in message:
-        return f"next: {command(arguments, ['preflight', str(arm)])}\n"
+        return f"next: {shell_line(arguments, ['preflight', str(arm)])}\n"
     if arm is not None and issubclass(kind, PositionUnknown):
-        return f"next: {command(arguments, ['set-home', str(arm)])}\n"
+        return f"next: {shell_line(arguments, ['set-home', str(arm)])}\n"
     if arm is None or not issubclass(kind, ArmFault | MotionRefused):
         return ""
     if "a motion needs joints." in message:  # the description lacks them
-        return f"next: {command(arguments, ['config', 'check', str(arm)])}\n"
+        return f"next: {shell_line(arguments, ['config', 'check', str(arm)])}\n"
     if arguments.word in _WITHOUT_ARM:
         return ""
     words = ["recover", str(arm)]
     if "preflight" in message and not issubclass(kind, ArmFault):
         slow = arguments.word in ("home", "recover")
         words = ["preflight", str(arm), *(["--home"] if slow else Ended(arguments, 0, {}, "").motion)]
-    return f"next: {command(arguments, words)}\n"
+    return f"next: {shell_line(arguments, words)}\n"
 
 
 def with_arm(arguments: argparse.Namespace, text: str) -> str:
@@ -129,7 +129,7 @@ def with_arm(arguments: argparse.Namespace, text: str) -> str:
     return _FOR_ARM.sub(lambda found: f"{found[1]}{shlex.quote(arm)}", text)
 
 
-def command(arguments: argparse.Namespace, words: Sequence[str]) -> str:
+def shell_line(arguments: argparse.Namespace, words: Sequence[str]) -> str:
     """Return the shell line `ident WORDS` with the given `--state`, and `--server` unless the verb is only local."""
     more = [] if arguments.state is None or "--state" in words else ["--state", arguments.state]
     local = words[0] in LOCAL_ONLY or " ".join(words[:2]) in LOCAL_ONLY

@@ -90,7 +90,7 @@ def add_lease(sub: Parser, *, confirm: bool = True) -> None:
 
 
 def requested_lease(
-    arguments: argparse.Namespace, config: ArmConfig, seconds: float | None = None
+    arguments: argparse.Namespace, config: ArmConfig, lease_seconds: float | None = None
 ) -> StdinLease | None:
     """Return the lease over standard input if the verb's arguments ask for one, else None.
 
@@ -100,7 +100,7 @@ def requested_lease(
     Args:
         arguments: arguments of the verb, with `lease_from_stdin`.
         config: of the arm.
-        seconds: length of the lease [s]; the ordinary length when None.
+        lease_seconds: length of the lease [s]; the ordinary length when None.
 
     Raises:
         UsageError: standard input is a terminal, at which nobody renews a lease by hand, or closed.
@@ -112,10 +112,10 @@ def requested_lease(
     from ident_service.motion.arm_factory import make_arm
     from ident_service.motion.command_channel import LEASE_SECONDS
 
-    lasts = LEASE_SECONDS if seconds is None else seconds
+    lasts = LEASE_SECONDS if lease_seconds is None else lease_seconds
     return StdinLease(math.inf if make_arm(config).clock.lock_step else lasts, sys.stdin.fileno())
 
 
-def stop_or_lapsed(stopping: Callable[[], bool], lease: StdinLease | None) -> Callable[[], bool]:
+def stop_or_lapsed(stop_requested: Callable[[], bool], lease: StdinLease | None) -> Callable[[], bool]:
     """Return a function that tells whether a stop was requested or the lease has ended."""
-    return stopping if lease is None else lambda: stopping() or lease.over()
+    return stop_requested if lease is None else lambda: stop_requested() or lease.over()

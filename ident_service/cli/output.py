@@ -39,7 +39,9 @@ def styled(stream: TextIO | None, text: str, style: str) -> str:
     return f"\x1b[{_STYLES[style]}m{text}\x1b[0m"
 
 
-def print_answer(arguments: argparse.Namespace, code: int, text: str, document: dict[str, Any], last: str = "") -> None:
+def print_answer(
+    arguments: argparse.Namespace, code: int, text: str, document: dict[str, Any], last_line: str = ""
+) -> None:
     """Print a verb's answer as text with a last line, or with `--json` as one JSON object.
 
     A daemon asks for the text in the object, as its `text`.
@@ -47,16 +49,16 @@ def print_answer(arguments: argparse.Namespace, code: int, text: str, document: 
     if arguments.json:
         _print_json({**document, **({"text": text} if arguments.with_text else {}), "exit_code": code})
     else:
-        write(sys.stdout, text + styled(sys.stdout, last, "next") if last else text)
+        write(sys.stdout, text + styled(sys.stdout, last_line, "next") if last_line else text)
 
 
-def print_error(kind: str, message: str, code: int, more: Mapping[str, object] | None = None) -> None:
+def print_error(kind: str, message: str, code: int, more_fields: Mapping[str, object] | None = None) -> None:
     """Print the one JSON object of a command that failed on stdout; `kind` is the name of an error of `errors.py`.
 
     Where it cannot be written, on a full disk for example, the exit code is left to say it.
     """
     with suppress(OSError):
-        _print_json({"error": {"kind": kind, "message": message}, **(more or {}), "exit_code": code})
+        _print_json({"error": {"kind": kind, "message": message}, **(more_fields or {}), "exit_code": code})
 
 
 def print_to_person(text: str) -> None:

@@ -17,9 +17,9 @@ from ident_service.cli.arguments import (
     Parser,
     VerbList,
     add_arm,
+    add_repeatable,
     count,
     frequency,
-    repeatable,
     seconds,
     seed,
     share,
@@ -27,7 +27,7 @@ from ident_service.cli.arguments import (
     workers,
 )
 from ident_service.cli.motion_commands import add_dry_run, dry_run
-from ident_service.cli.next_command import command
+from ident_service.cli.next_command import shell_line
 from ident_service.cli.output import (
     DONE,
     USAGE,
@@ -38,7 +38,7 @@ from ident_service.cli.output import (
     tell,
     writable_state_folder,
 )
-from ident_service.cli.progress import step_of, typed
+from ident_service.cli.progress import step_of, typed_confirmation
 from ident_service.errors import UsageError
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ def _add_prior_data_options(sub: Parser) -> None:
         "--model", type=Path, metavar="FILE", help="parameters.json to predict torques with, instead of the prior"
     )
     sub.add_argument("--noise", type=Path, metavar="FILE", help="parameters.json whose residuals are the noise")
-    repeatable(sub, "--after", "RECORDING", "add to the information of this recording, or of FILE@41:60", Path)
+    add_repeatable(sub, "--after", "RECORDING", "add to the information of this recording, or of FILE@41:60", Path)
 
 
 def _knowledge(arguments: argparse.Namespace) -> PriorData:
@@ -388,7 +388,7 @@ def _bus_report(arguments: argparse.Namespace) -> Answer:
 
 def _require_name(arguments: argparse.Namespace, name: str, what: str) -> None:
     """Require that a person has typed the arm's name; raises UsageError."""
-    if typed(arguments, f"{name}: {what}. Type the arm's name to go on:") != name:
+    if typed_confirmation(arguments, f"{name}: {what}. Type the arm's name to go on:") != name:
         raise UsageError(f"{what}: that is confirmed by the arm's name, typed: --confirm {name}; nothing was written")
 
 
@@ -434,7 +434,7 @@ def _driver_test(arguments: argparse.Namespace) -> Answer:
     config = load_arm(arguments.arm)
 
     with ControlFile.take(control_path(writable_state_folder(arguments), config.name), None):
-        found = try_driver(config, partial(typed, arguments))
+        found = try_driver(config, partial(typed_confirmation, arguments))
     broken = any(one.outcome is Outcome.BROKEN for one in found)
     document = {"arm": config.name, "kept": not broken, "promises": [asdict(one) for one in found]}
     return VERDICT_NO if broken else DONE, contract_text(config.name, found), document
@@ -460,7 +460,7 @@ def _scan(arguments: argparse.Namespace) -> Answer:
 
 def _probe(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm, sheet_file
-    from ident_service.operations.fieldbus import FILE, bus_probe, keep_outcome, probe_document, probe_text
+    from ident_service.operations.fieldbus import FILE, bus_probe, probe_document, probe_text, store_probe_outcome
     from ident_service.registry.state_folder import arm_folder
 
     config = load_arm(arguments.arm)
@@ -468,7 +468,7 @@ def _probe(arguments: argparse.Namespace) -> Answer:
     text, document = probe_text(config, found), probe_document(config, found)
     if not arguments.eds:
         path = arm_folder(writable_state_folder(arguments), config.name) / FILE
-        document |= {"changed": keep_outcome(path, document), "kept": str(path)}
+        document |= {"changed": store_probe_outcome(path, document), "kept": str(path)}
         text += "".join(f"CHANGED: {line}\n" for line in document["changed"]) + f"kept in {path}\n"
     return DONE if found.good else VERDICT_NO if found.readable else USAGE, text, document
 
@@ -503,7 +503,7 @@ def _doctor(arguments: argparse.Namespace) -> Answer:
     findings = kernel_findings(settings) + ([] if config is None else bus_findings(config))
     tell(arguments, f"measuring wake-up latency for {arguments.seconds:g} s; Ctrl-C ends it early")
     stopping = StopOnSignal()
-    step_of(arguments)("measuring wake-up latency", left=arguments.seconds)
+    step_of(arguments)("measuring wake-up latency", seconds_left=arguments.seconds)
     with stopping:
         woken = measure_wake_up(measuring_rate(rate), arguments.seconds, settings, stop_requested=stopping.requested)
     held = judge_rates(woken, rate, None if config is None else config.control.longest_stall, watchdogs)
@@ -591,7 +591,7 @@ def _add_emulate(verbs: VerbList) -> None:
     )
     add_arm(sub)
     form = "'KIND [joint=NAME] [at=S] [duration=S] [size=X] [offset=X,Y,Z]', counted from the first SYNC; repeatable"
-    repeatable(sub, "--fault", "FAULT", form)
+    add_repeatable(sub, "--fault", "FAULT", form)
     sub.add_argument(
         "--eds",
         nargs="+",
@@ -611,7 +611,7 @@ def _emulate(arguments: argparse.Namespace) -> Answer:
     config = with_sheets(load_arm(arguments.arm), arguments.eds)
     emulated_buses(config)  # refuses before memory is locked, which takes a while
     first = ["set-home", arguments.arm] if config.zeroed_at_home else ["bus", "scan", arguments.arm]
-    then = f"; in another terminal: `{command(arguments, first)}`"
+    then = f"; in another terminal: `{shell_line(arguments, first)}`"
     tell(arguments, f"{config.name}: emulated drives; Ctrl-C ends{then}")
     stopping = StopOnSignal()
     # On another core than the motion process, if there is one.

@@ -104,15 +104,15 @@ class ProgressBar:
         if self._thread is not None:
             self._thread.join(_LEAVE)
 
-    def step(self, words: str, share: float | None = None, left: float | None = None) -> None:
+    def step(self, words: str, share: float | None = None, seconds_left: float | None = None) -> None:
         """Set the words, share and time left that the bar shows next; never waits.
 
         Args:
             words: description of the step for a person.
             share: share of all work that is done, from 0 to 1.
-            left: time to the end [s].
+            seconds_left: time to the end [s].
         """
-        self._mark = mark = Mark(time.monotonic(), words, share, left)
+        self._mark = mark = Mark(time.monotonic(), words, share, seconds_left)
         if self._first.share is None:
             self._first = mark
 
@@ -210,7 +210,7 @@ def ask(arguments: argparse.Namespace, question: str) -> str:
         return input(question)
 
 
-def typed(arguments: argparse.Namespace, question: str) -> str:
+def typed_confirmation(arguments: argparse.Namespace, question: str) -> str:
     """Return what `--confirm` says, or else what a person at the terminal types; empty where nobody can be asked."""
     if arguments.confirm is not None:
         return str(arguments.confirm)

@@ -16,7 +16,7 @@ from ident_service.cli.answer_texts import reidentified_text
 from ident_service.cli.archive_commands import add_by, registry, terminal_user
 from ident_service.cli.arguments import VerbList, add_arm
 from ident_service.cli.motion_commands import add_can_log, add_dry_run, described_arm, dry_run, run_and_report
-from ident_service.cli.next_command import command
+from ident_service.cli.next_command import shell_line
 from ident_service.cli.operator_input import add_lease, requested_lease, stop_or_lapsed
 from ident_service.cli.output import (
     DONE,
@@ -30,7 +30,7 @@ from ident_service.cli.output import (
     tell,
     writable_state_folder,
 )
-from ident_service.cli.progress import typed
+from ident_service.cli.progress import typed_confirmation
 from ident_service.errors import ArmError, MotionRefused, PersonNeeded, UsageError
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ def _move_held_arm_home(arguments: argparse.Namespace, config: ArmConfig) -> Ans
             controls.renew_home()
             time.sleep(0.1 * LEASE_SECONDS)
     write_audit_entry(arguments, "home", config.name, reached=[config.name])
-    supported = command(arguments, ["supported", arguments.arm])
+    supported = shell_line(arguments, ["supported", arguments.arm])
     document = {"arm": config.name, "asked": "home", "pid": pid, "ended": stage.name.lower()}
     if stage is Homing.ENDED and not stopped:
         return DONE, f"{config.name}: at home; held there until `{supported}`\n", document
@@ -149,7 +149,7 @@ def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
     def confirm(question: str) -> str:
         if lease is not None and lease.over():
             raise MotionRefused(f"{config.name}: home not set: {lease.reason}; nothing has changed")
-        return typed(arguments, question)
+        return typed_confirmation(arguments, question)
 
     done = set_home(config, writable_state_folder(arguments), confirm)
     lines = [f"{done.arm}: home is set, until its drives lose power", *(f"  {words}" for words in done.drives)]
@@ -180,7 +180,7 @@ def _recover(arguments: argparse.Namespace) -> Answer:
         raise UsageError("--lease-from-stdin is for --leave-limit; without it nothing moves")
     if arguments.can_log:
         raise UsageError("--can-log is for --leave-limit; without it nothing moves")
-    found = recover(config, writable_state_folder(arguments), called=arguments.arm)
+    found = recover(config, writable_state_folder(arguments), name_in_commands=arguments.arm)
     document = asdict(found) | {"seen": None if found.seen is None else watch_document(found.seen)}
     return DONE if found.usable else VERDICT_NO, _text(found), document
 
@@ -189,7 +189,7 @@ def _move_slowly(arguments: argparse.Namespace, config: ArmConfig, destination: 
     from ident_service.motion.faults import HOLD
 
     ends = {
-        "hold": f"the arm is held until `{command(arguments, ['supported', arguments.arm])}`, then lowered",
+        "hold": f"the arm is held until `{shell_line(arguments, ['supported', arguments.arm])}`, then lowered",
         "lower": f"the arm is held for {HOLD:g} s, then lowered until it rests",
     }.get(config.control.after_stop or "", f"the arm is held for {HOLD:g} s, then its drives brake it")
     lease = requested_lease(arguments, config)

@@ -14,7 +14,7 @@ from contextlib import closing, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.answer_texts import asked_text, stop_text, told
+from ident_service.cli.answer_texts import answer_of, asked_text, stop_text
 from ident_service.cli.arguments import LOCAL_ONLY, VerbList, columns_files, count
 from ident_service.cli.output import (
     DONE,
@@ -27,8 +27,8 @@ from ident_service.cli.output import (
     state_folder,
     tell,
 )
-from ident_service.cli.progress import step_of, typed
-from ident_service.cli.remote_recordings import file_of, recording, require_registered
+from ident_service.cli.progress import step_of, typed_confirmation
+from ident_service.cli.remote_recordings import file_of, recording_reference, require_registered
 from ident_service.cli.remote_recordings import word_of_address as word_of_address
 from ident_service.errors import AccessRefused, ArmError, IdentError, UnknownId, UsageError
 
@@ -83,7 +83,7 @@ def run_on_daemon(arguments: argparse.Namespace) -> Answer:
         UsageError: a verb that no daemon does.
         IdentError: as the daemon says.
     """
-    verbs = table()
+    verbs = remote_verbs()
     if arguments.word not in verbs:
         why = LOCAL_ONLY.get(arguments.word, "not available on a daemon")
         raise UsageError(f"{arguments.word}: {why}; --server is for {', '.join(sorted(verbs))}")
@@ -96,36 +96,41 @@ def run_on_daemon(arguments: argparse.Namespace) -> Answer:
     return _with_client(verb)(arguments)
 
 
-def table() -> dict[str, RemoteVerb]:
+def remote_verbs() -> dict[str, RemoteVerb]:
     """Map each verb that a daemon can do to (its function, the names of the arguments that it sends)."""
     from ident_service.cli import remote_results, remote_watching
 
     return REMOTE | remote_results.VERBS | remote_watching.VERBS
 
 
-def carrying(words: str, verb: Verb) -> RemoteVerb:
-    """Return (function of a remote verb, set of the arguments that it sends), these from `words`, divided by spaces."""
-    return verb, frozenset(words.split())
+def remote_verb(argument_names: str, verb: Verb) -> RemoteVerb:
+    """Return (function of a remote verb, set of the arguments that it sends), these named in a text with spaces."""
+    return verb, frozenset(argument_names.split())
 
 
-def job(
-    words: str, kind: str | None = None, *, more: str = "", ended: Ended | None = None, **fields: Reader
+def remote_job(
+    argument_names: str,
+    kind: str | None = None,
+    *,
+    further_arguments: str = "",
+    ended: Ended | None = None,
+    **fields: Reader,
 ) -> RemoteVerb:
-    """Return a remote verb that runs a job; the job's fields are the arguments named in `words` and what `fields` read.
+    """Return a remote verb that runs a job; its fields are the arguments of these names and what `fields` read.
 
     Args:
-        words: arguments that are fields of the job under their own names.
+        argument_names: arguments that are fields of the job under their own names.
         kind: kind of the job; the verb when None.
-        more: further arguments, which `fields` read.
+        further_arguments: further arguments, which `fields` read.
         ended: function that turns the job's answer into the verb's; the job's own answer when None.
         fields: reader of each further field's value.
     """
 
     def make(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-        plain = {name: getattr(arguments, name) for name in words.split()}
+        plain = {name: getattr(arguments, name) for name in argument_names.split()}
         return {"kind": kind} | plain | {name: read(client, arguments) for name, read in fields.items()}
 
-    return carrying(f"{words} {more}", job_verb(make, ended))
+    return remote_verb(f"{argument_names} {further_arguments}", job_verb(make, ended))
 
 
 def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
@@ -194,7 +199,7 @@ def _identify(client: IdentClient, arguments: argparse.Namespace) -> dict[str, A
         raise UsageError(f"--columns {lost[0]}=...: is no file here; a recording that is there has its columns")
 
     def named(path: Path) -> dict[str, Any]:
-        return recording(client, arguments, arguments.arm, path, of_one.get(file_of(path), of_all))
+        return recording_reference(client, arguments, arguments.arm, path, of_one.get(file_of(path), of_all))
 
     return {
         "arm": arguments.arm,
@@ -212,7 +217,7 @@ def _seconds(_: IdentClient, arguments: argparse.Namespace) -> float | None:
 
 
 def _after(client: IdentClient, arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    return [recording(client, arguments, arguments.arm, path) for path in arguments.after]
+    return [recording_reference(client, arguments, arguments.arm, path) for path in arguments.after]
 
 
 def motion_of(client: IdentClient, arguments: argparse.Namespace) -> str | None:
@@ -287,7 +292,7 @@ def _ack(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 
 
 def _list(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    return told(arguments, {"jobs": client.get(f"/api/v1/jobs?most={min(arguments.most, 500)}")})
+    return answer_of(arguments, {"jobs": client.get(f"/api/v1/jobs?most={min(arguments.most, 500)}")})
 
 
 def _show(client: IdentClient, arguments: argparse.Namespace) -> Answer:
@@ -304,26 +309,26 @@ def _cancel(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 
 
 REMOTE: dict[str, RemoteVerb] = {
-    "simulate": job("arm seed feasible_set", more="motion", motion=motion_of),
-    "identify": carrying("arm columns feasible_set method prior recordings validate", job_verb(_identify)),
-    "design": job(
+    "simulate": remote_job("arm seed feasible_set", further_arguments="motion", motion=motion_of),
+    "identify": remote_verb("arm columns feasible_set method prior recordings validate", job_verb(_identify)),
+    "design": remote_job(
         "arm starts seed criterion motion",
-        more="after chosen search_time",
+        further_arguments="after chosen search_time",
         seconds=_seconds,
         parameters=lambda _, arguments: arguments.chosen,
         after=_after,
     ),
-    "preflight": job("arm home", "check", more="confirm motion", motion=motion_of),
-    "home": carrying("arm confirm zero", job_verb(_home)),
-    "set-home": carrying("arm confirm", job_verb(_home)),
-    "stop": carrying("arm", _stop),
-    **dict.fromkeys(("pause", "resume", "finish"), carrying("arm", _ask)),
-    "supported": carrying("arm confirm", _supported),
-    "acknowledge": carrying("arm fault", _ack),
-    "jobs": carrying("most", _list),
-    "jobs show": carrying("job", _show),
-    "jobs watch": carrying("job", _watch),
-    "jobs cancel": carrying("job", _cancel),
+    "preflight": remote_job("arm home", "check", further_arguments="confirm motion", motion=motion_of),
+    "home": remote_verb("arm confirm zero", job_verb(_home)),
+    "set-home": remote_verb("arm confirm", job_verb(_home)),
+    "stop": remote_verb("arm", _stop),
+    **dict.fromkeys(("pause", "resume", "finish"), remote_verb("arm", _ask)),
+    "supported": remote_verb("arm confirm", _supported),
+    "acknowledge": remote_verb("arm fault", _ack),
+    "jobs": remote_verb("most", _list),
+    "jobs show": remote_verb("job", _show),
+    "jobs watch": remote_verb("job", _watch),
+    "jobs cancel": remote_verb("job", _cancel),
 }
 
 
@@ -338,30 +343,32 @@ def _wait_for_job(
     """Wait for the end of a job and renew its lease; on Ctrl-C cancel it, if this command began it."""
     stopping = StopOnSignal()
     with stopping:
-        return job_answer(client, follow(client, arguments, job, stopping.requested, moves=moves, ours=ours))
+        return job_answer(
+            client, follow(client, arguments, job, stopping.requested, moves=moves, cancel_on_give_up=ours)
+        )
 
 
 def follow(
     client: IdentClient,
     arguments: argparse.Namespace,
     job: dict[str, Any],
-    over: Callable[[], bool],
+    give_up: Callable[[], bool],
     *,
     moves: bool,
-    ours: bool = True,
-    every: float = _LOOK,
+    cancel_on_give_up: bool = True,
+    poll_seconds: float = _LOOK,
 ) -> dict[str, Any]:
-    """Poll a job to its end, print its phases, renew its lease, cancel it if `ours` once `over()`; return it.
+    """Poll a job to its end, print its phases, renew its lease, cancel it once `give_up()` if it is ours; return it.
 
     Args:
         client: of the daemon.
         arguments: of the verb.
         job: the job in the daemon's answer.
-        over: function that is called in each turn; once it returns True, the lease is renewed no more, and the job is
-            cancelled.
+        give_up: function that is called in each turn; once it returns True, the lease is renewed no more, and the job
+            is cancelled.
         moves: whether the job has a lease.
-        ours: whether this command began the job; another one is left alone, and no longer waited for.
-        every: s between turns; the job itself is looked at less often.
+        cancel_on_give_up: whether this command began the job; another one is left alone, and no longer waited for.
+        poll_seconds: s between turns; the job itself is looked at less often.
 
     Returns:
         The job as it was last; it runs still where its end cannot be entered for 10 s, or after Ctrl-C.
@@ -376,15 +383,15 @@ def follow(
             entered = time.monotonic()
         elif cancelled or time.monotonic() - entered > UNENTERED:
             break
-        if not cancelled and over():
+        if not cancelled and give_up():
             cancelled = True
-            if not ours or unentered:
+            if not cancel_on_give_up or unentered:
                 break
             with suppress(UsageError):  # it has ended meanwhile, as the next look will tell
                 client.post(f"/api/v1/jobs/{job['id']}/cancel")
         elif moves and not cancelled:
             moves = renew(client, job["id"])
-        time.sleep(every)
+        time.sleep(poll_seconds)
         if time.monotonic() - looked < _LOOK:
             continue
         looked, held = time.monotonic(), job["held"]
@@ -404,10 +411,10 @@ def follow(
     return job
 
 
-def renew(client: IdentClient, job: str) -> bool:
+def renew(client: IdentClient, job_id: str) -> bool:
     """Renew the lease of a job and return True; return False if it has none, as its motion is ending or has ended."""
     try:
-        client.post(f"/api/v1/jobs/{job}/lease")
+        client.post(f"/api/v1/jobs/{job_id}/lease")
     except IdentError as error:
         if "has no lease" not in str(error):
             raise
@@ -459,17 +466,17 @@ def typed_name(arguments: argparse.Namespace) -> str:
     """
     what = "gets a new zero" if getattr(arguments, "zero", False) else "will move"
     what = "is lowered" if arguments.word == "supported" else what
-    name = typed(arguments, f"{arguments.arm} {what} where you may not see it. Type its name to confirm:")
+    name = typed_confirmation(arguments, f"{arguments.arm} {what} where you may not see it. Type its name to confirm:")
     if name != arguments.arm:
         raise UsageError(f"confirm by the arm's name: --confirm {arguments.arm}")
     return name
 
 
-def confirmation(client: IdentClient, arguments: argparse.Namespace, name: str | None = None) -> dict[str, str]:
+def confirmation(client: IdentClient, arguments: argparse.Namespace, arm_name: str | None = None) -> dict[str, str]:
     """Return a motion's confirmation: the arm's name as a person typed it, and a challenge from the daemon."""
-    name = typed_name(arguments) if name is None else name
+    arm_name = typed_name(arguments) if arm_name is None else arm_name
     word = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/challenge")["challenge"]
-    return {"name": name, "challenge": word}
+    return {"name": arm_name, "challenge": word}
 
 
 def motion_id(client: IdentClient, arm: str, motion: Path | None) -> str | None:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ident_service.client import IdentClient
 
 
-def recording(
+def recording_reference(
     client: IdentClient, arguments: argparse.Namespace, arm: str, path: Path, columns: Path | None = None
 ) -> dict[str, Any]:
     """Return the fields by which a job names a recording; upload it first if it is a local file, else check its run.
@@ -42,26 +42,26 @@ def recording(
     return {"run": run, **({"name": name} if name else {}), **bounded}
 
 
-def require_registered(client: IdentClient, kind: str, named: str, path: Path) -> None:
-    """Raise UnknownId unless the daemon knows a run or motion of the id `named`; local files are not looked at.
+def require_registered(client: IdentClient, kind: str, registered_id: str, path: Path) -> None:
+    """Raise UnknownId unless the daemon knows a run or motion of the id `registered_id`; local files are not looked at.
 
     Args:
         client: of the daemon.
         kind: `run` or `motion`.
-        named: text that may be its id.
+        registered_id: text that may be its id.
         path: path as the person gave it.
 
     Raises:
         UnknownId: it is neither.
     """
-    plain = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,119}", named) is not None
+    plain = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,119}", registered_id) is not None
     try:
         if plain:
-            client.get(f"/api/v1/{kind}s/{named}")
+            client.get(f"/api/v1/{kind}s/{registered_id}")
     except UnknownId:
         plain = False
     if not plain:
-        raise UnknownId(f"{path}: no such file here, and the daemon at {client.url} has no {kind} {named!r}")
+        raise UnknownId(f"{path}: no such file here, and the daemon at {client.url} has no {kind} {registered_id!r}")
 
 
 def word_of_address(word: str) -> str:

@@ -13,22 +13,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from ident_service.cli.answer_texts import reidentified_text, told
+from ident_service.cli.answer_texts import answer_of, reidentified_text
 from ident_service.cli.archive_commands import hint_at_anyway
 from ident_service.cli.identification_commands import OF_ARMS, accepted_name
 from ident_service.cli.output import DONE, FAILED, VERDICT_NO, Answer, StopOnSignal, tell
 from ident_service.cli.recovery_commands import EXIT_CODES
 from ident_service.cli.remote import (
     RemoteVerb,
-    carrying,
     confirmation,
-    job,
     job_answer,
     job_verb,
     motion_of,
+    remote_job,
+    remote_verb,
     word_of_address,
 )
-from ident_service.cli.remote_recordings import recording
+from ident_service.cli.remote_recordings import recording_reference
 from ident_service.errors import ArmError, UsageError
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def _compare(client: IdentClient, arguments: argparse.Namespace) -> dict[str, An
 
 def _with_payload(client: IdentClient, arguments: argparse.Namespace) -> list[dict[str, Any]]:
     arm = str(client.get(f"{_API}/runs/{_run(client, arguments)}")["arm"])
-    return [recording(client, arguments, arm, path) for path in arguments.recordings]
+    return [recording_reference(client, arguments, arm, path) for path in arguments.recordings]
 
 
 def _fetched(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
@@ -137,7 +137,7 @@ def _answered(words: str, values: Callable[[IdentClient, argparse.Namespace], di
         words: names of the arguments that `values` sends.
         values: function that asks the daemon for the values.
     """
-    return carrying(words, lambda client, arguments: told(arguments, values(client, arguments)))
+    return remote_verb(words, lambda client, arguments: answer_of(arguments, values(client, arguments)))
 
 
 def _posted(words: str, path: str, also: str = "") -> RemoteVerb:
@@ -205,7 +205,7 @@ def _dismiss(client: IdentClient, arguments: argparse.Namespace) -> dict[str, An
 
 def _alarms(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     rows = client.get(f"{_API}/{_of_arm(arguments)}")
-    return told(arguments, {"alarms": rows}, VERDICT_NO if rows else DONE)
+    return answer_of(arguments, {"alarms": rows}, VERDICT_NO if rows else DONE)
 
 
 def _reidentify(client: IdentClient, arguments: argparse.Namespace) -> Answer:
@@ -240,22 +240,26 @@ def _reidentify(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 _DELETES = ("runs delete", "motions delete", "arms delete")
 # The audit trail has the token's name there, so that `--by` is not sent.
 VERBS: dict[str, RemoteVerb] = {
-    "report": job("", more="out run", run=_run, ended=_reported),
-    "export": job("", more="format out run", run=_run, formats=_formats, ended=_fetched),
-    "fleet identify": job(
+    "report": remote_job("", further_arguments="out run", run=_run, ended=_reported),
+    "export": remote_job("", further_arguments="format out run", run=_run, formats=_formats, ended=_fetched),
+    "fleet identify": remote_job(
         "arm",
         "fleet",
-        more="out patterns settle_again",
+        further_arguments="out patterns settle_again",
         arms=lambda _, arguments: arguments.patterns,
         settle_again=lambda _, arguments: arguments.settle_again or None,
         ended=_fleet,
     ),
-    "figures": job("format", more="out run", run=_run, ended=_fetched),
-    "payload": job("refit_offsets", more="out recordings run", run=_run, recordings=_with_payload, ended=_fetched),
-    "compare": carrying("others reference", job_verb(_compare)),
-    "verify": job("arm", more="file", run=_run_of_file),
-    "feasible": job("arm feasible_set", more="file", run=_run_of_file),
-    "project": job("arm feasible_set metric", "correct", more="file out", run=_run_of_file, ended=_corrected),
+    "figures": remote_job("format", further_arguments="out run", run=_run, ended=_fetched),
+    "payload": remote_job(
+        "refit_offsets", further_arguments="out recordings run", run=_run, recordings=_with_payload, ended=_fetched
+    ),
+    "compare": remote_verb("others reference", job_verb(_compare)),
+    "verify": remote_job("arm", further_arguments="file", run=_run_of_file),
+    "feasible": remote_job("arm feasible_set", further_arguments="file", run=_run_of_file),
+    "project": remote_job(
+        "arm feasible_set metric", "correct", further_arguments="file out", run=_run_of_file, ended=_corrected
+    ),
     "accept": _answered("note run", _accept),
     "rollback": _posted("arm note to", "arms/{arm}/rollback"),
     "prune": _posted("keep yes", "recordings/prune"),
@@ -271,7 +275,7 @@ VERBS: dict[str, RemoteVerb] = {
     ),
     "maintenance": _answered("arm note what", _maintenance),
     "due dismiss": _answered("note number", _dismiss),
-    "alarms": carrying("arm", _alarms),
+    "alarms": remote_verb("arm", _alarms),
     "alarms acknowledge": _posted("note number", "alarms/{number}/ack"),
-    "reidentify": carrying("arm confirm motion", _reidentify),
+    "reidentify": remote_verb("arm confirm motion", _reidentify),
 }

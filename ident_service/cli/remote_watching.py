@@ -18,14 +18,14 @@ from ident_service.cli.motion_commands import SLOW, HeldKey, require_held, requi
 from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, tell
 from ident_service.cli.remote import (
     RemoteVerb,
-    carrying,
     confirmation,
     follow,
-    job,
     job_answer,
     job_verb,
     motion_id,
     motion_of,
+    remote_job,
+    remote_verb,
     run_job,
     telling_of_arm,
     typed_name,
@@ -128,18 +128,18 @@ def _hold_to_run(client: IdentClient, arguments: argparse.Namespace, terminal: i
         tell(arguments, f"job {made['id']}")
         over = stopping.requested if key is None else lambda: stopping.requested() or key.released()
         with telling_of_arm(arguments.arm, made["id"]):
-            return job_answer(client, follow(client, arguments, made, over, moves=True, every=_RENEW))
+            return job_answer(client, follow(client, arguments, made, over, moves=True, poll_seconds=_RENEW))
 
 
 VERBS: dict[str, RemoteVerb] = {
-    "watch": job("arm seconds"),
-    "recover": carrying("arm confirm leave_limit", job_verb(_recover)),
-    "base-parameters": job("arm", "base"),
-    "preview": job("arm", more="motion", motion=motion_of),
-    "bus load": job("arm rate", "bus_load"),
-    "bus scan": job("arm", "bus_scan"),
-    "bus probe": job("arm", "bus_probe"),
-    "config check": carrying("file", _config_check),
-    "run": carrying("arm chosen confirm hold_to_run motion speed until", _run),
-    "rehearse": carrying("arm confirm motion no_key speed", _rehearse),
+    "watch": remote_job("arm seconds"),
+    "recover": remote_verb("arm confirm leave_limit", job_verb(_recover)),
+    "base-parameters": remote_job("arm", "base"),
+    "preview": remote_job("arm", further_arguments="motion", motion=motion_of),
+    "bus load": remote_job("arm rate", "bus_load"),
+    "bus scan": remote_job("arm", "bus_scan"),
+    "bus probe": remote_job("arm", "bus_probe"),
+    "config check": remote_verb("file", _config_check),
+    "run": remote_verb("arm chosen confirm hold_to_run motion speed until", _run),
+    "rehearse": remote_verb("arm confirm motion no_key speed", _rehearse),
 }

@@ -117,7 +117,7 @@ def _sent(
     """Send what the daemon has not yet; return what the upload became."""
     try:
         _send(connection, stream, seen, tell)
-        return dict(connection.ask("POST", f"{_UPLOADS}/{seen['id']}/complete", {}, patience=_CHECKING))
+        return dict(connection.ask("POST", f"{_UPLOADS}/{seen['id']}/complete", {}, timeout_seconds=_CHECKING))
     except (UnknownId, AlreadyThere) as error:
         if isinstance(error, UnknownId) and seen["id"] not in str(error):
             raise  # the arm is gone
@@ -280,7 +280,7 @@ class IdentClient(Connection):
         return {"run": str(seen["run"]), "name": str(seen["name"])}
 
     def begin(self, kind: str, *, key: str | None = None, **asked: Any) -> Job:
-        """Queue a computation and return its job at once, without waiting for it.
+        """Queue a computation and return its job at once; with the `key` of an earlier one, return that job instead.
 
         Args:
             kind: `simulate`, `design`, `identify`, `export` and so on.
@@ -389,7 +389,7 @@ class RemoteArm:
     def run(
         self, motion: str | None = None, *, confirm: str, speed: float | None = None, until: float | None = None
     ) -> RemoteMotion:
-        """Queue a run of a motion; return its handle, whose `with` block renews the lease and waits for the end.
+        """Queue a run, finished early at the accuracy `until`; return a handle whose block renews the lease and waits.
 
         Args:
             motion: id; the description's own if None.
@@ -423,20 +423,20 @@ class RemoteArm:
         return RemoteMotion(self.client, _job(self.client.post(f"{_API}/jobs", body)))
 
 
-def left_alone(gone: ArmError, arm: str, job: str) -> ArmError:
-    """Return an ArmError: the words of `gone`, how the arm stops by itself, and which commands show it.
+def left_alone(connection_error: ArmError, arm: str, job: str) -> ArmError:
+    """Return an ArmError: the words of `connection_error`, how the arm stops by itself, and which commands show it.
 
     Args:
-        gone: error that tells why the daemon cannot be reached.
+        connection_error: error that tells why the daemon cannot be reached.
         arm: name.
         job: id of its motion.
     """
     return ArmError(
-        f"{gone}. {arm} stops by itself: a daemon that ends or dies lets its motions go, and each stops under control "
-        f"within two seconds of its last lease. An arm without brakes is then held until a person has supported it "
-        f"and says so: `ident supported {arm}`. `ident recover {arm}` at the daemon's machine shows how it stands, "
-        f"`ident stop {arm}` there stops it at once; neither needs the daemon. Once the daemon is back, `ident jobs "
-        f"show {job}` tells how the motion ended"
+        f"{connection_error}. {arm} stops by itself: a daemon that ends or dies lets its motions go, and each stops "
+        f"under control within two seconds of its last lease. An arm without brakes is then held until a person has "
+        f"supported it and says so: `ident supported {arm}`. `ident recover {arm}` at the daemon's machine shows how "
+        f"it stands, `ident stop {arm}` there stops it at once; neither needs the daemon. Once the daemon is back, "
+        f"`ident jobs show {job}` tells how the motion ended"
     )
 
 

@@ -90,7 +90,7 @@ class Connection:
         body: Any = None,
         headers: Mapping[str, str] = NOTHING,
         *,
-        patience: float | None = None,
+        timeout_seconds: float | None = None,
     ) -> Any:
         """Send one request, wait for its answer and return that as JSON values; raise the error that the daemon names.
 
@@ -99,12 +99,12 @@ class Connection:
             path: path on the daemon, from the root.
             body: JSON values, or bytes that are sent as they are.
             headers: headers besides those of the body.
-            patience: how long to wait for the answer [s]; as for every other request if None.
+            timeout_seconds: how long to wait for the answer [s]; as for every other request if None.
 
         Raises:
             IdentError: the daemon refused, with its own error; or it cannot be reached.
         """
-        return self._document(*self._exchange(method, path, body, headers, patience)[:2])
+        return self._document(*self._exchange(method, path, body, headers, timeout_seconds)[:2])
 
     def pages(self, path: str) -> Iterator[Any]:
         """Yield the entries of a paged list, requesting page by page to its end; raise IdentError if that fails."""

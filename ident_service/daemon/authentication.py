@@ -91,24 +91,24 @@ class Authenticator:
         """Copy tokens and sessions from the registry, where another process may have changed them."""
         self._tokens, self._sessions = digests(self._db), sessions(self._db)
 
-    def known(self, secret: str | None, session: str | None) -> Access | None:
-        """Return name and role of a token, or else a session, by the copy in memory; None if it is not valid.
+    def known(self, token: str | None, session: str | None) -> Access | None:
+        """Return name and role of a token, or else a session's secret, by the copy in memory; None if it is not valid.
 
         A token that was revoked at a terminal counts here until the next `refresh`, which each request brings about.
         """
-        key = None if secret is None else digest(secret)
-        if secret is None and session is not None:
+        key = None if token is None else digest(token)
+        if token is None and session is not None:
             key, until = self._sessions.get(digest(session), (None, 0.0))
             key = key if until >= time.time() else None
         return None if key is None else self._tokens.get(key)
 
-    def by_token(self, secret: str, address: str) -> Access | None:
+    def by_token(self, token: str, address: str) -> Access | None:
         """Return a token's name and role by the registry; None, a failed attempt, if unknown; Throttled after too many.
 
         Raises:
             Throttled: too many failed attempts; a token that was good from this address before is still heard.
         """
-        key = (address, digest(secret))
+        key = (address, digest(token))
         with self._lock:
             if key not in self._good:
                 self._throttle.require(*key)
@@ -122,13 +122,13 @@ class Authenticator:
                 _remember(self._good, key, None, _MOST_ADDRESSES)
         return found
 
-    def log_in(self, secret: str, address: str) -> tuple[str, Access] | None:
+    def log_in(self, token: str, address: str) -> tuple[str, Access] | None:
         """Begin a session for a token; return (the session's secret, its name and role), None for an unknown token."""
-        found = self.by_token(secret, address)
+        found = self.by_token(token, address)
         if found is None:
             return None
         session = secrets.token_urlsafe(32)
-        begin_session(self._db, session, secret, time.time() + SESSION_SECONDS, _MOST_SESSIONS)
+        begin_session(self._db, session, token, time.time() + SESSION_SECONDS, _MOST_SESSIONS)
         self.refresh()
         return session, found
 
@@ -150,10 +150,10 @@ class Authenticator:
             _remember(self._challenges, word, entry, _MOST_CHALLENGES)
         return word
 
-    def confirm(self, word: str, arm: str, who: str) -> bool:
+    def confirm(self, challenge_word: str, arm: str, who: str) -> bool:
         """Return whether the challenge was given to this caller for this arm and still counts; use it up either way."""
         with self._lock:
-            entry = self._challenges.pop(word, None)
+            entry = self._challenges.pop(challenge_word, None)
         return entry is not None and (entry.arm, entry.who) == (arm, who) and entry.until >= self._now()
 
 

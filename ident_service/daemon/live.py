@@ -130,8 +130,8 @@ class LiveRun:
         self._lost = False
         self.broken = ""
 
-    def since(self, number: int) -> list[Frame]:
-        """Return the kept frames numbered above `number`, after reading on in the recording unless just done."""
+    def since(self, frame_number: int) -> list[Frame]:
+        """Return the kept frames numbered above `frame_number`, after reading on in the recording unless just done."""
         now = self._now()
         self._seen = now
         if self._lock.acquire(blocking=False):
@@ -144,7 +144,7 @@ class LiveRun:
                 _LOG.warning("a run cannot be watched: %s", error)
             finally:
                 self._lock.release()
-        return [frame for frame in list(self._frames) if frame.number > number]
+        return [frame for frame in list(self._frames) if frame.number > frame_number]
 
     def close(self) -> None:
         """Close the recording's file; `since` then reads nothing more."""
@@ -217,11 +217,11 @@ class LiveRuns:
     def __init__(self) -> None:
         self._lock, self._runs = threading.Lock(), OrderedDict[str, LiveRun]()
 
-    def run(self, name: str, folder: Path) -> LiveRun:
+    def run(self, run_id: str, folder: Path) -> LiveRun:
         """Return the live view of the run of this id, made if new; the longest unused ones are closed if too many."""
         with self._lock:
-            found = self._runs.setdefault(name, LiveRun(folder))
-            self._runs.move_to_end(name)
+            found = self._runs.setdefault(run_id, LiveRun(folder))
+            self._runs.move_to_end(run_id)
             while len(self._runs) > _MOST_RUNS:
                 self._runs.popitem(last=False)[1].close()
         return found
@@ -231,10 +231,10 @@ class LiveRuns:
         for name in list(self._runs):
             self.forget(name)
 
-    def forget(self, name: str) -> None:
+    def forget(self, run_id: str) -> None:
         """Close and remove a run that has ended."""
         with self._lock:
-            found = self._runs.pop(name, None)
+            found = self._runs.pop(run_id, None)
         if found is not None:
             found.close()
 

@@ -63,35 +63,35 @@ class Metrics:
         self._lateness = _Lateness()
         registry.register(self._lateness)
 
-    def request(self, method: str, status: int, seconds: float, *, stop: bool = False) -> None:
+    def record_request(self, method: str, status: int, seconds: float, *, is_stop: bool = False) -> None:
         """Count one request by method and status, and its duration [s], also among stops if it was one."""
         known = method if method in _METHODS else "other"
         self._requests.labels(known, str(status)).inc()
         self._seconds.inc(seconds)
         self._request.labels(known).observe(seconds)
-        if stop:
+        if is_stop:
             self._stop.observe(seconds)
 
-    def renewed(self, age: float) -> None:
+    def record_lease_age(self, lease_age: float) -> None:
         """Record how old [s] a lease was when it was renewed."""
-        self._lease.observe(age)
+        self._lease.observe(lease_age)
 
-    def job(self, kind: str, state: str, waited: float, ran: float | None) -> None:
+    def record_job(self, kind: str, state: str, waited_seconds: float, ran_seconds: float | None) -> None:
         """Record a job that has ended.
 
         Args:
             kind: of the job.
             state: final state of the job.
-            waited: time before it began or was cancelled [s].
-            ran: time from its beginning to its end [s]; None for one that never began.
+            waited_seconds: time before it began or was cancelled [s].
+            ran_seconds: time from its beginning to its end [s]; None for one that never began.
         """
-        self._wait.labels(kind).observe(waited)
-        if ran is not None:
-            self._job.labels(kind, state).observe(ran)
+        self._wait.labels(kind).observe(waited_seconds)
+        if ran_seconds is not None:
+            self._job.labels(kind, state).observe(ran_seconds)
 
-    def lateness(self, document: Any) -> None:
+    def add_lateness(self, ended_document: Any) -> None:
         """Add the lateness histogram of a run, from its `ended.json`; a document of another form is left out."""
-        self._lateness.add(document)
+        self._lateness.add(ended_document)
 
     def text(
         self, jobs: Mapping[tuple[str, str], int], moving: Iterable[str], faults: Sizes, due: Sizes, alarms: Sizes

@@ -91,22 +91,22 @@ class EventPoller:
         self._standing = dict[tuple[str, str], _Standing]()
         self._ending = set[str]()  # jobs whose end may not have been seen
 
-    def begin(self, after: int | None) -> ViewerPosition:
-        """Return where a new viewer begins: behind the audit line `after`, or behind the last one if None.
+    def begin(self, last_seen_line: int | None) -> ViewerPosition:
+        """Return where a new viewer begins: behind the audit line `last_seen_line`, or behind the last one if None.
 
         Args:
-            after: number of the last line that was seen; only events from now on are reported if None.
+            last_seen_line: number of the last line that was seen; only events from now on are reported if None.
         """
         last = last_line(self._db)
         # A number beyond the last line comes from another state folder, or from before a restore.
-        return ViewerPosition(last if after is None or after > last else after)
+        return ViewerPosition(last if last_seen_line is None or last_seen_line > last else last_seen_line)
 
     @property
     def due(self) -> bool:
         """Return whether `LOOK` seconds have passed since the last poll."""
         return self._now() - self._looked >= LOOK
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Poll the registry and the arms, unless another thread polls now or has just done so."""
         if not self._lock.acquire(blocking=False):
             return
@@ -119,29 +119,29 @@ class EventPoller:
         finally:
             self._lock.release()
 
-    def behind(self, seen: ViewerPosition) -> bool:
+    def behind(self, position: ViewerPosition) -> bool:
         """Return whether a viewer misses lines that are no longer in memory."""
-        return self._line is not None and seen.line < self._line and not self._has_buffered_line(seen.line)
+        return self._line is not None and position.line < self._line and not self._has_buffered_line(position.line)
 
-    def earlier(self, seen: ViewerPosition) -> list[ViewerEvent]:
+    def earlier(self, position: ViewerPosition) -> list[ViewerEvent]:
         """Return the next page of audit lines for a viewer who is behind, and move the viewer's position on."""
-        found = [_line(row) for row in audit_entries_after(self._db, seen.line, _PAGE)]
+        found = [_line(row) for row in audit_entries_after(self._db, position.line, _PAGE)]
         # No lines: the registry has been restored to an earlier state.
-        seen.line = (found[-1].number if found else self._line) or 0
+        position.line = (found[-1].number if found else self._line) or 0
         return found
 
-    def since(self, seen: ViewerPosition) -> list[ViewerEvent]:
+    def since(self, position: ViewerPosition) -> list[ViewerEvent]:
         """Return the events in memory that are new to a viewer, and move the viewer's position on; never waits."""
-        found = [one for one in list(self._lines) if one.number is not None and one.number > seen.line]
+        found = [one for one in list(self._lines) if one.number is not None and one.number > position.line]
         if found and found[-1].number is not None:
-            seen.line = found[-1].number
-        version, first = self._version, seen.version < 0
+            position.line = found[-1].number
+        version, first = self._version, position.version < 0
         standing = [
             (one.version, ViewerEvent(kind, one.data))
             for (kind, _), one in list(self._standing.items())
-            if seen.version < one.version <= version and not (first and one.gone is not None)
+            if position.version < one.version <= version and not (first and one.gone is not None)
         ]
-        seen.version = version
+        position.version = version
         return found + [one for _, one in sorted(standing, key=lambda pair: pair[0])]
 
     def _has_buffered_line(self, line: int) -> bool:

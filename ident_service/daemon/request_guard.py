@@ -130,7 +130,7 @@ class RequestGuardMiddleware:
             self._bodies.held -= body.held
             self._connections.answered(peer)
             stop = scope["method"] == "POST" and scope["path"].endswith("/stop")
-            self._metrics.request(scope["method"], status, time.perf_counter() - began, stop=stop)
+            self._metrics.record_request(scope["method"], status, time.perf_counter() - began, is_stop=stop)
             _LOG.info(
                 "request",
                 extra={

@@ -36,33 +36,33 @@ class RecentDocuments:
     def __init__(self) -> None:
         self._lock, self._kept = threading.Lock(), OrderedDict[tuple[str, ...], str]()
 
-    def document(self, key: tuple[str, ...], make: Callable[[], dict[str, Any]]) -> str:
-        """Return the JSON text kept for this key, or else of what `make` returns, which is then kept."""
+    def document(self, key: tuple[str, ...], make_document: Callable[[], dict[str, Any]]) -> str:
+        """Return the JSON text kept for this key, or else of what `make_document` returns, which is then kept."""
         with self._lock:  # one at a time: reading recordings and distances of bodies are what costs
             if (found := self._kept.get(key)) is None:
-                found = self._kept[key] = json.dumps(make(), allow_nan=False)
+                found = self._kept[key] = json.dumps(make_document(), allow_nan=False)
                 while len(self._kept) > _KEPT:
                     self._kept.popitem(last=False)
             self._kept.move_to_end(key)
             return found
 
 
-def series(folder: Path, recording: str) -> dict[str, Any]:
+def series(folder: Path, recording_name: str) -> dict[str, Any]:
     """Return a recording, thinned for display, as JSON values: time [s] and a list per joint, events.
 
     Args:
         folder: of the run.
-        recording: name of its recording.
+        recording_name: name of its recording.
 
     Raises:
         RecordingError: it is damaged.
         UsageError: it is too large to be drawn.
     """
-    path = folder / recording
+    path = folder / recording_name
     if (size := path.stat().st_size) > MOST_BYTES:
         raise UsageError(
-            f"{recording}: {size / 2**20:.0f} MiB are too many to be drawn here, {MOST_BYTES / 2**20:.0f} at most; "
-            "download the file and open it in PlotJuggler, Foxglove or Rerun"
+            f"{recording_name}: {size / 2**20:.0f} MiB are too many to be drawn here, {MOST_BYTES / 2**20:.0f} at "
+            "most; download the file and open it in PlotJuggler, Foxglove or Rerun"
         )
     follower = RecordingFollower(path)
     try:

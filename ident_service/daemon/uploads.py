@@ -46,12 +46,12 @@ if TYPE_CHECKING:
 LONGEST_HEADER: Final = 2**20  # bytes
 
 
-def format_of(columns: str, name: str, config: ArmConfig) -> RecordingFormat:
+def format_of(columns_text: str, recording_name: str, config: ArmConfig) -> RecordingFormat:
     """Return the format that a columns file, given as text, describes for a recording of this arm; or raise.
 
     Args:
-        columns: content of the file.
-        name: of the recording.
+        columns_text: content of the file.
+        recording_name: of the recording.
         config: of its arm.
 
     Raises:
@@ -61,8 +61,8 @@ def format_of(columns: str, name: str, config: ArmConfig) -> RecordingFormat:
     from ident_service.operations.recordings import own_formats
 
     with tempfile.TemporaryDirectory(prefix="ident-columns.") as place:
-        file, recording = Path(place) / COLUMNS, Path(name)
-        file.write_text(columns, encoding="utf-8", errors="replace")
+        file, recording = Path(place) / COLUMNS, Path(recording_name)
+        file.write_text(columns_text, encoding="utf-8", errors="replace")
         try:
             return own_formats({recording: file}, [recording], arm_model(config))[recording]
         except ConfigError as error:
@@ -73,10 +73,10 @@ def format_of(columns: str, name: str, config: ArmConfig) -> RecordingFormat:
             raise UsageError(str(error).replace(f"{place}/", "")) from None
 
 
-def first_line(path: Path, *, packed: bool) -> bytes:
-    """Return the first line of a CSV as far as it has arrived, unpacked if it is `packed` by gzip."""
+def first_line(path: Path, *, is_gzip: bool) -> bytes:
+    """Return the first line of a CSV as far as it has arrived, unpacked if `is_gzip`."""
     with path.open("rb") as stream:
-        if not packed:
+        if not is_gzip:
             return stream.readline(LONGEST_HEADER)
         try:
             with gzip.open(stream) as unpacked:
@@ -205,7 +205,7 @@ def require_header(db: Database, state: Path, upload: str) -> None:
     if not announced.columns or (folder / _JUDGED).exists() or ".csv" not in announced.name.lower():
         return
     with _known(upload):
-        line = first_line(folder / _DATA, packed=announced.name.endswith(".gz"))
+        line = first_line(folder / _DATA, is_gzip=announced.name.endswith(".gz"))
     if not line.endswith(b"\n") and len(line) < LONGEST_HEADER and seen.received < announced.bytes:
         return  # it has not all arrived
     form = format_of(announced.columns, announced.name, known_arm(db, state, announced.arm).config)
@@ -240,18 +240,18 @@ def require_readable(path: Path, announced: Announced, config: ArmConfig) -> Non
         raise RecordingError(announced.name, f"no recording of {announced.arm} can be read from it: {words}") from None
 
 
-def known_upload(state: Path, upload: str) -> Upload:
+def known_upload(state: Path, upload_id: str) -> Upload:
     """Return the upload of this id, with the bytes received so far.
 
     Raises:
         UnknownId: there is none; it was completed, deleted, or left alone for a day.
     """
-    folder = state / UPLOADS / upload
+    folder = state / UPLOADS / upload_id
     try:
         announced = Announced(**json.loads((folder / UPLOAD).read_text(encoding="utf-8")))
-        return Upload(upload, announced, (folder / _DATA).stat().st_size)
+        return Upload(upload_id, announced, (folder / _DATA).stat().st_size)
     except (OSError, ValueError, TypeError):
-        raise _unknown(upload) from None
+        raise _unknown(upload_id) from None
 
 
 def uploads(state: Path) -> list[Upload]:
@@ -327,13 +327,13 @@ class Piece:
         os.close(self._fd)
 
 
-def complete_upload(db: Database, state: Path, upload: str, who: str) -> Upload:
+def complete_upload(db: Database, state: Path, upload_id: str, who: str) -> Upload:
     """Make a run of a whole upload, return it with the run's id; if its hash or content is wrong, delete it and raise.
 
     Args:
         db: the registry.
         state: the state folder.
-        upload: id.
+        upload_id: id.
         who: name of the requester.
 
     Raises:
@@ -342,10 +342,10 @@ def complete_upload(db: Database, state: Path, upload: str, who: str) -> Upload:
         RecordingError: its content has another hash than was announced, or is no recording of the arm; what had
             arrived is deleted.
     """
-    seen = known_upload(state, upload)
-    announced, folder = seen.announced, state / UPLOADS / upload
+    seen = known_upload(state, upload_id)
+    announced, folder = seen.announced, state / UPLOADS / upload_id
     arm = known_arm(db, state, announced.arm)
-    with Piece(state, upload, seen.received):  # locked, so that nobody else writes it
+    with Piece(state, upload_id, seen.received):  # locked, so that nobody else writes it
         if seen.received != announced.bytes:
             raise AlreadyThere(f"{announced.name}: has {seen.received} of {announced.bytes} bytes; send the rest first")
         run = new_id(arm.name)
@@ -354,7 +354,7 @@ def complete_upload(db: Database, state: Path, upload: str, who: str) -> Upload:
             write_atomically(built / UPLOAD, json.dumps({"format": "ident-upload", "version": 1, **asdict(announced)}))
             if announced.columns:
                 write_atomically(built / COLUMNS, announced.columns)
-            with _known(upload), (folder / _DATA).open("rb") as stream:
+            with _known(upload_id), (folder / _DATA).open("rb") as stream:
                 os.fsync(stream.fileno())
                 (folder / _DATA).rename(built / announced.name)
             write_manifest(built)
@@ -370,7 +370,7 @@ def complete_upload(db: Database, state: Path, upload: str, who: str) -> Upload:
     except UnknownId:  # somebody deleted the arm while all of the recording was read
         forget_run(db, state, run, who)
         raise
-    return Upload(upload, announced, announced.bytes, run)
+    return Upload(upload_id, announced, announced.bytes, run)
 
 
 def _unknown(upload: str) -> UnknownId:
@@ -396,14 +396,14 @@ def _delete_on_hash_mismatch(folder: Path) -> Iterator[None]:
         raise
 
 
-def delete_upload(state: Path, upload: str) -> None:
+def delete_upload(state: Path, upload_id: str) -> None:
     """Delete an upload and what has arrived of it.
 
     Raises:
         UnknownId: no such upload.
     """
-    known_upload(state, upload)
-    shutil.rmtree(state / UPLOADS / upload, ignore_errors=True)
+    known_upload(state, upload_id)
+    shutil.rmtree(state / UPLOADS / upload_id, ignore_errors=True)
 
 
 def delete_stale_uploads(state: Path) -> list[str]:

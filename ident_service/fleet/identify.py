@@ -64,7 +64,7 @@ from ident_service.fleet.trends import Change, compare_arms
 from ident_service.model.chain import Array
 from ident_service.operations.drift_alarms import verdict_of
 from ident_service.operations.parameter_files import DOCUMENT, compare_files
-from ident_service.results.manifest import replacing_folder, require_place, write_atomically
+from ident_service.results.manifest import replacing_folder, require_writable_place, write_atomically
 
 
 def identify_fleet(
@@ -98,7 +98,7 @@ def identify_fleet(
 
 
 def _require_replaceable(folder: Path) -> None:
-    require_place(folder)
+    require_writable_place(folder)
     if not folder.exists():
         return
     try:

@@ -102,8 +102,10 @@ def accept(db: Database, state: Path, folder: Path, note: str, who: str, *, arm:
     return act
 
 
-def rollback(db: Database, state: Path, arm: str, note: str, who: str, to: int | None = None) -> Acceptance:
-    """Make an earlier accepted set the current one again; return the new acceptance that does so.
+def rollback(
+    db: Database, state: Path, arm: str, note: str, who: str, acceptance_number: int | None = None
+) -> Acceptance:
+    """Make an accepted set, by default the one before, the current one again; return the new acceptance that does so.
 
     Args:
         db: the registry.
@@ -111,7 +113,7 @@ def rollback(db: Database, state: Path, arm: str, note: str, who: str, to: int |
         arm: name.
         note: reason for the rollback.
         who: name of the requester.
-        to: number of the acceptance; the one before the current set's if None.
+        acceptance_number: number of the acceptance; the one before the current set's if None.
 
     Raises:
         UsageError: no note, no name, or there is no such set.
@@ -122,15 +124,15 @@ def rollback(db: Database, state: Path, arm: str, note: str, who: str, to: int |
         acts = acceptances(state, arm)
         if not acts:
             raise UsageError(f"{arm}: nothing has been accepted yet")
-        if to is None:
+        if acceptance_number is None:
             earlier = [act for act in acts if act.number == act.origin and act.number < acts[-1].origin]
             if not earlier:
                 raise UsageError(f"{arm}: nothing was accepted before the current set")
             target = earlier[-1]
-        elif 1 <= to <= len(acts):
-            target = acts[to - 1]
+        elif 1 <= acceptance_number <= len(acts):
+            target = acts[acceptance_number - 1]
         else:
-            raise UsageError(f"{arm}: no acceptance {to}; they are numbered from 1 to {len(acts)}")
+            raise UsageError(f"{arm}: no acceptance {acceptance_number}; they are numbered from 1 to {len(acts)}")
         act = Acceptance(
             *(arm, len(acts) + 1, target.run, target.origin, target.parameters_sha256),
             *(note, round(time.time(), 3), who),
@@ -158,8 +160,8 @@ def acceptances(state: Path, arm: str) -> list[Acceptance]:
     return acts
 
 
-def accepted_set(state: Path, arm: str, number: int | None = None) -> tuple[Acceptance, Path]:
-    """Return (acceptance, folder of its files), the current one if `number` is None; its parameters are verified.
+def accepted_set(state: Path, arm: str, acceptance_number: int | None = None) -> tuple[Acceptance, Path]:
+    """Return (acceptance, folder of its files), the current one if the number is None; `parameters.json` is verified.
 
     Raises:
         UsageError: nothing was accepted, or nothing of this number.
@@ -168,16 +170,16 @@ def accepted_set(state: Path, arm: str, number: int | None = None) -> tuple[Acce
     acts = acceptances(state, arm)
     if not acts:
         raise UsageError(f"{arm}: nothing has been accepted yet; `ident accept RUN` accepts those of a run")
-    if number is not None and not 1 <= number <= len(acts):
-        raise UsageError(f"{arm}: no acceptance {number}; they are numbered from 1 to {len(acts)}")
-    act = acts[-1 if number is None else number - 1]
+    if acceptance_number is not None and not 1 <= acceptance_number <= len(acts):
+        raise UsageError(f"{arm}: no acceptance {acceptance_number}; they are numbered from 1 to {len(acts)}")
+    act = acts[-1 if acceptance_number is None else acceptance_number - 1]
     folder = _folder(state, arm, act.number)
     _require_as_accepted(folder, act)
     return act, folder
 
 
 def current_file(state: Path, arm: str) -> Path:
-    """Return the file with an arm's current parameters, there or not."""
+    """Return the path of the file with an arm's current parameters, whether it exists or not."""
     return arm_folder(state, arm) / CURRENT / PARAMETERS
 
 

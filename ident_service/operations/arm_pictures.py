@@ -66,7 +66,7 @@ class MotionExtent:
 
 
 def motion_extent(model: ArmModel, excitation: Excitation, speed: float = 1.0) -> MotionExtent:
-    """Return how far, how fast and how long an arm goes along a motion.
+    """Return how far, how fast and how long an arm goes along a motion at a share `speed` of the motion's own speed.
 
     Args:
         model: of the arm.

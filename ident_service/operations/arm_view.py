@@ -56,12 +56,12 @@ def figure(model: ArmModel) -> dict[str, Any]:
     }
 
 
-def view_of_motion(config: ArmConfig, motion: Path | None, speed: float = 1.0) -> dict[str, Any]:
-    """Return, as JSON values to draw, an arm from home along a motion and back: positions over time, phases, notes.
+def view_of_motion(config: ArmConfig, motion_file: Path | None, speed: float = 1.0) -> dict[str, Any]:
+    """Return, as JSON values to draw, an arm from home along a motion and back at a share `speed` of its speed.
 
     Args:
         config: of the arm.
-        motion: file of the motion, None for the description's own; what it repeats is shown once.
+        motion_file: file of the motion, None for the description's own; what it repeats is shown once.
         speed: share of its own speed, above 0 and at most 1.
 
     Raises:
@@ -69,7 +69,7 @@ def view_of_motion(config: ArmConfig, motion: Path | None, speed: float = 1.0) -
         MotionRefused: the arm's description lacks limits.
     """
     model, limits = arm_model(config), motion_limits(config)
-    named = excitation(model, "identification", checked=False) if motion is None else read_excitation(motion)
+    named = excitation(model, "identification", checked=False) if motion_file is None else read_excitation(motion_file)
     path = named.path
     if path.joints != model.chain.joints:
         raise UsageError(f"a motion of {path.joints} joints, but {config.name} has {model.chain.joints}")
@@ -116,20 +116,24 @@ def _grid(begin: float, end: float, rate: float) -> Array:
     return np.linspace(begin, end, max(round((end - begin) * rate) + 1, 2))
 
 
-def view_of_recording(config: ArmConfig, path: Path, fmt: RecordingFormat | None = None) -> dict[str, Any]:
+def view_of_recording(
+    config: ArmConfig, recording_file: Path, recording_format: RecordingFormat | None = None
+) -> dict[str, Any]:
     """Return, as JSON values to draw, an arm with the positions of a recording over time, thinned.
 
     Args:
         config: of the arm.
-        path: the recording.
-        fmt: how a file of others is to be read; as the arm's description says when None.
+        recording_file: the recording.
+        recording_format: how a file of others is to be read; as the arm's description says when None.
 
     Raises:
         RecordingError: it cannot be read, or has no samples.
     """
     model = arm_model(config)
-    fmt = config.recording if fmt is None else fmt
-    recording = open_recording(path, model.chain.names, fmt=fmt, transmission=config.transmission)
+    recording_format = config.recording if recording_format is None else recording_format
+    recording = open_recording(
+        recording_file, model.chain.names, fmt=recording_format, transmission=config.transmission
+    )
     stamps, positions = [], []
     next_ns = -np.inf
     for block in recording.blocks():
@@ -140,7 +144,7 @@ def view_of_recording(config: ArmConfig, path: Path, fmt: RecordingFormat | None
         stamps.append(block.stamp_ns[chosen])
         positions.append(block.position[chosen])
     if not stamps:
-        raise RecordingError(path, "has no samples")
+        raise RecordingError(recording_file, "has no samples")
     stamp, position = np.concatenate(stamps), np.concatenate(positions)
     kept = np.unique(np.linspace(0, len(stamp) - 1, min(len(stamp), MOST_SAMPLES)).astype(int))
     return _view(model, (stamp[kept] - stamp[0]) * 1e-9, position[kept], [], [])

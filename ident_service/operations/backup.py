@@ -80,31 +80,31 @@ class Backup:
     replaced: str | None = None
 
 
-def back_up(state: Path, file: Path, *, recordings: bool = True) -> Backup:
+def back_up(state: Path, backup_file: Path, *, recordings: bool = True) -> Backup:
     """Write the state folder into one new file, a backup; a daemon may serve the state folder meanwhile.
 
     Args:
         state: the state folder.
-        file: path of the backup, which appears when it is whole; readable by its owner only.
+        backup_file: path of the backup, which appears when it is whole; readable by its owner only.
         recordings: whether those of runs are copied; if not, the copy's registry calls them deleted.
 
     Raises:
         UsageError: there is no registry or it is damaged, the file exists, or lies in the state folder, or cannot be
             written.
-        DiskFull: the disk of `file` has no room.
+        DiskFull: the disk of `backup_file` has no room.
         RegistryBusy: another process keeps the registry.
     """
     require_no_interrupted_restore(state)
     if not (state / FILE).is_file():
         raise UsageError(f"{state}: has no registry, so there is nothing to back up")
-    if file.exists():
-        raise UsageError(f"{file}: exists; give another name")
-    if file.resolve().is_relative_to(state.resolve()):
-        raise UsageError(f"{file}: lies in the state folder; give a place that outlives it")
-    partial = file.with_name(f".{file.name}.{secrets.token_hex(4)}.partial")
+    if backup_file.exists():
+        raise UsageError(f"{backup_file}: exists; give another name")
+    if backup_file.resolve().is_relative_to(state.resolve()):
+        raise UsageError(f"{backup_file}: lies in the state folder; give a place that outlives it")
+    partial = backup_file.with_name(f".{backup_file.name}.{secrets.token_hex(4)}.partial")
     created = time.time()
     try:
-        with tempfile.TemporaryDirectory(dir=file.parent, prefix=".ident-backup.") as place:
+        with tempfile.TemporaryDirectory(dir=backup_file.parent, prefix=".ident-backup.") as place:
             snapshot = Path(place) / FILE
             _copy_registry(state / FILE, snapshot, recordings=recordings)
             fd = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
@@ -116,31 +116,31 @@ def back_up(state: Path, file: Path, *, recordings: bool = True) -> Backup:
                     _add_document(tar, _MANIFEST, {"files": hashes}, created)
                 stream.flush()
                 os.fsync(stream.fileno())
-        partial.replace(file)
+        partial.replace(backup_file)
     except sqlite3.Error as error:
         # The full disk is that of the copy, beside the file: nothing is written to the registry.
-        if isinstance(shortage(file, error), DiskFull):
-            raise _full(file) from None
+        if isinstance(shortage(backup_file, error), DiskFull):
+            raise _full(backup_file) from None
         raise registry_error(state / FILE, error) from None
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise _full(file) from None
-        raise UsageError(f"{file}: cannot be written: {error.strerror or error}") from None
+            raise _full(backup_file) from None
+        raise UsageError(f"{backup_file}: cannot be written: {error.strerror or error}") from None
     finally:
         with suppress(OSError):  # after the replacement there is none
             partial.unlink()
-    return Backup(str(file), len(hashes), size, created, recordings)
+    return Backup(str(backup_file), len(hashes), size, created, recordings)
 
 
 def _full(file: Path) -> DiskFull:
     return DiskFull(f"{file}: cannot be written: its disk is full; make room there, or give another place")
 
 
-def restore(file: Path, state: Path, who: str, *, replace: bool = False) -> Backup:
+def restore(backup_file: Path, state: Path, who: str, *, replace: bool = False) -> Backup:
     """Restore a backup into a state folder, upgraded to this software; all is checked before anything changes.
 
     Args:
-        file: the backup.
+        backup_file: the backup.
         state: the state folder.
         who: name of the person who restores, for the audit trail.
         replace: whether the old content is moved into a folder inside `state`; otherwise `state` must be empty.
@@ -149,8 +149,8 @@ def restore(file: Path, state: Path, who: str, *, replace: bool = False) -> Back
         UsageError: not a backup, or not whole; a daemon serves the folder, or it is not empty.
         MotionRefused: an arm of the state folder is being moved.
     """
-    if not file.is_file():
-        raise UsageError(f"{file}: no such file")
+    if not backup_file.is_file():
+        raise UsageError(f"{backup_file}: no such file")
     missing = [path for path in (state / LOCK, state, *state.parents) if not path.exists()]
     with single_instance(state), _removed_on_failure(missing):
         if moving := moving_arms(state):
@@ -160,10 +160,10 @@ def restore(file: Path, state: Path, who: str, *, replace: bool = False) -> Back
             raise UsageError(f"{state}: is not empty; with --replace, what is there goes into a folder in it")
         staging = state / f".{secrets.token_hex(4)}.partial"
         try:
-            head, files, size = _extract(file, staging)
+            head, files, size = _extract(backup_file, staging)
             with Database(staging) as db:
                 if not db.sound():
-                    raise UsageError(f"{file}: its registry is damaged; use another backup")
+                    raise UsageError(f"{backup_file}: its registry is damaged; use another backup")
                 revoke_first_tokens(db, who)  # whose file stays behind; the next start makes another one
                 note(db, who, "restored", "state folder", created=head["created"], software=head["software"])
             replaced = _exchange(state, staging)
@@ -171,7 +171,7 @@ def restore(file: Path, state: Path, who: str, *, replace: bool = False) -> Back
             raise UsageError(f"{state}: cannot be written: {error.strerror or error}") from None
         finally:
             shutil.rmtree(staging, ignore_errors=True)
-    return Backup(str(file), files, size, head["created"], head["recordings"], replaced)
+    return Backup(str(backup_file), files, size, head["created"], head["recordings"], replaced)
 
 
 @contextmanager

@@ -78,27 +78,29 @@ def true_parameters(config: ArmConfig, model: ArmModel) -> Array | None:
     return with_payload(config, model.chain.names, model.layout, model.layout.vector(config.driver.truth))
 
 
-def score(estimate: Estimate, truth: Array, plant_motion: Sequence[Truth], unseen: Equations) -> Score:
+def score(
+    estimate: Estimate, true_delta: Array, plant_motion: Sequence[Truth], validation_equations: Equations
+) -> Score:
     """Compare an estimate with the truth: deviations in sigma, noise-free torque error [%], residual over the truth's.
 
     Args:
         estimate: identified estimate.
-        truth: the plant's link parameters, shape (layout.size,).
+        true_delta: the plant's link parameters, shape (layout.size,).
         plant_motion: true motion of the plant in the validation run.
-        unseen: equations of the validation recording.
+        validation_equations: equations of the validation recording.
     """
-    true_beta = estimate.base.K @ truth
+    true_beta = estimate.base.K @ true_delta
     deviations = (estimate.beta - true_beta) / estimate.standard_deviations
     identified = np.array([verdict == "identified" for verdict in estimate.verdicts])
     sizes = np.where(identified, np.abs(deviations), -1.0)
     worst = int(np.argmax(sizes))
-    left = torque_error(unseen.total, true_beta).rms
+    left = torque_error(validation_equations.total, true_beta).rms
     return Score(
         deviations=deviations,
         worst_identified=float(max(sizes[worst], 0.0)),
         worst_expression=estimate.base.expressions[worst],
         noise_free_percent=_noise_free_percent(estimate, true_beta, plant_motion),
-        residual_ratio=torque_error(unseen.total, estimate.beta).rms / left,
+        residual_ratio=torque_error(validation_equations.total, estimate.beta).rms / left,
     )
 
 
@@ -151,7 +153,7 @@ def record_motion(
     arm: Arm,
     model: ArmModel,
     motion: Excitation,
-    path: Path,
+    recording_file: Path,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> RunReport:
     """Open an arm, run one motion, record it into a new MCAP file, and return the report, also after a stop.
@@ -160,7 +162,7 @@ def record_motion(
         arm: the arm, not yet open.
         model: of the arm.
         motion: motion to run.
-        path: of the MCAP file; it must not exist.
+        recording_file: the MCAP file; it must not exist.
         stop_requested: called every cycle; True stops the motion.
 
     Raises:
@@ -176,7 +178,7 @@ def record_motion(
     metadata["clock"] = "virtual" if arm.clock.lock_step else "monotonic"
     metadata["driver"] = "" if model.config.driver is None else model.config.driver.kind
     recorder = RecorderProcess(
-        path,
+        recording_file,
         model.chain.names,
         description,
         utc_offset_of_recording_ns(arm.clock),

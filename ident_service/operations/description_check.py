@@ -63,37 +63,37 @@ class CheckedDescription:
         return not self.objections
 
 
-def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescription:
+def check_description(description: str | Path, *, upload: bool = False) -> CheckedDescription:
     """Load a description, ConfigError for mistakes; judge bus budget, gains, stop behaviour; return what was found.
 
     Args:
-        arm: file of the description, or name of a shipped one.
+        description: file of the description, or name of a shipped one.
         upload: whether somebody has sent it (`load_arm`).
 
     Raises:
         ConfigError: every mistake in it, each with line and column; also for an invalid mechanism, a driver that is
             not installed, and for a bus budget that does not fit.
     """
-    config = load_arm(arm, upload=upload)
-    problems, model = [*_driver_problems(arm, config), *_mass_problems(arm, config)], None
+    config = load_arm(description, upload=upload)
+    problems, model = [*_driver_problems(description, config), *_mass_problems(description, config)], None
     try:
         model = arm_model(config)
         names = model.layout.names
     except ParameterError as error:
         names = arm_model(config.model_copy(update={"prior": None, "payload": None})).layout.names
-        unknown = list(_name_problems(arm, names, config, ("prior",)))
-        problems += unknown or [located(arm, ("prior",), f"prior: {error}")]
+        unknown = list(_name_problems(description, names, config, ("prior",)))
+        problems += unknown or [located(description, ("prior",), f"prior: {error}")]
     except ModelError as error:
         message = _NAMED.sub("", str(error), count=1)
         where = _place(str(error))
-        raise ConfigError([*problems, located(arm, where, f"{'.'.join(where)}: {message}")]) from None
+        raise ConfigError([*problems, located(description, where, f"{'.'.join(where)}: {message}")]) from None
     for where in (("driver", "truth"), ("driver", "emulation", "truth")):
-        problems += _name_problems(arm, names, config, where)
+        problems += _name_problems(description, names, config, where)
     if problems or model is None:
         raise ConfigError(problems)
-    budget, cut_off = _bus(arm, config)
+    budget, cut_off = _bus(description, config)
     warnings = (*cut_off, *remarks_on_angles(base_parameters(model.chain, model.layout)))
-    if missing := _missing(arm, model):
+    if missing := _missing(description, model):
         checked = CheckedDescription(model, budget, None, None, warnings=warnings)
         # An arm without a driver is identified from recordings, and needs none of them.
         return replace(checked, missing=missing) if config.driver is None else replace(checked, objections=missing)
@@ -104,24 +104,24 @@ def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescri
         follows = None if model.prior is None else after_stop(model, limits)
     except MotionRefused as refusal:
         # Its remedies are several keys; the joints are where brakes would stand.
-        objections.append(located(arm, ("control", "after_stop"), str(refusal)))
+        objections.append(located(description, ("control", "after_stop"), str(refusal)))
     falling = () if model.prior is None else joints_with_weight(model, limits)
     if model.prior is None and config.driver is not None:
         remedy = "give `prior`, or a URDF or MJCF with the masses of its links"
         objections.append(
-            located(arm, ("kinematics",), f"kinematics: computed torque needs a model of the links; {remedy}")
+            located(description, ("kinematics",), f"kinematics: computed torque needs a model of the links; {remedy}")
         )
     if config.driver is not None:
         try:
             CollisionModel(model)
         except ModelError as error:
-            objections.append(located(arm, ("kinematics",), f"kinematics: {error}"))
+            objections.append(located(description, ("kinematics",), f"kinematics: {error}"))
     gains = stability(model, limits, delay_of(model.config))
     for words in gains.objections():
         joint = words.partition(":")[0]
         where = ("joints", joint, "kp") if joint in config.joints else ("control", "rate")
         remedy = "lower kp and kd, or raise control.rate or control.velocity_cutoff"
-        objections.append(located(arm, where, f"gains: {words}; {remedy}"))
+        objections.append(located(description, where, f"gains: {words}; {remedy}"))
     return CheckedDescription(model, budget, gains, follows, tuple(objections), (), warnings, falling)
 
 
@@ -216,15 +216,15 @@ def description_document(checked: CheckedDescription) -> dict[str, Any]:
     }
 
 
-def description_text(arm: str, checked: CheckedDescription) -> str:
-    """Format a checked description as text, the verdict first; `arm` as the user named it."""
+def description_text(named_as: str, checked: CheckedDescription) -> str:
+    """Format a checked description as text, the verdict first; `named_as` as the user named it."""
     model = checked.model
     verdict = "good"
     if checked.missing:
         verdict = "good for identification from recordings; it cannot be moved"
     if checked.objections:
         verdict = "CANNOT MOVE"
-    head = f"{arm}: {model.config.name}, {model.chain.joints} joints, {model.layout.size} parameters: {verdict}\n"
+    head = f"{named_as}: {model.config.name}, {model.chain.joints} joints, {model.layout.size} parameters: {verdict}\n"
     head += "".join(f"  {one}\n" for one in (*checked.objections, *checked.missing))
     if (payload := model.config.payload) is not None:
         unknown = "; no prior, so no model has it" if model.prior is None else ""

@@ -26,7 +26,7 @@ _MODULE: Final = "ident_service.operations.description_process"
 _NEW, _DRAW = "new", "draw"  # the words for the second thing, and the third
 
 
-def judge_apart(path: Path) -> dict[str, Any]:
+def judge_apart(description_file: Path) -> dict[str, Any]:
     """Judge an uploaded description in a separate process; return `good`, `objections` and more, or raise ConfigError.
 
     Returns:
@@ -36,17 +36,17 @@ def judge_apart(path: Path) -> dict[str, Any]:
         ConfigError: its mistakes.
         ModelError: any other error of it, or judging it takes too long or crashes.
     """
-    answer = _answer(path.name, path, _DEADLINE)
+    answer = _answer(description_file.name, description_file, _DEADLINE)
     if (problems := answer.get("problems")) is not None:
         raise ConfigError([Problem(Path(where), line, column, said) for where, line, column, said in problems])
     return answer
 
 
-def describe_apart(path: Path, name: str) -> dict[str, Any]:
+def describe_apart(urdf_file: Path, name: str) -> dict[str, Any]:
     """Make a description of an uploaded URDF in a separate process; return `description` (YAML), `files` and `guessed`.
 
     Args:
-        path: path of the URDF, its meshes beside it.
+        urdf_file: the URDF, its meshes beside it.
         name: of the arm.
 
     Returns:
@@ -55,21 +55,21 @@ def describe_apart(path: Path, name: str) -> dict[str, Any]:
     Raises:
         ModelError: there is no arm in it, or it takes too long or crashes.
     """
-    return _answer(path.name, path, 3.0 * _DEADLINE, _NEW, name)
+    return _answer(urdf_file.name, urdf_file, 3.0 * _DEADLINE, _NEW, name)
 
 
-def draw_apart(path: Path, meshes: Path, out: Path) -> None:
+def draw_apart(description_file: Path, mesh_folder: Path, new_folder: Path) -> None:
     """Make triangles of an uploaded arm's meshes in a separate process: `OUT/JOINT.f32`, and `drawn.json` beside them.
 
     Args:
-        path: of the description.
-        meshes: folder of its meshes.
-        out: folder that is made.
+        description_file: the description.
+        mesh_folder: folder of its meshes.
+        new_folder: folder that is made.
 
     Raises:
         ModelError: it takes too long or crashes.
     """
-    _answer("the meshes", path, 3.0 * _DEADLINE, _DRAW, str(meshes), str(out))
+    _answer("the meshes", description_file, 3.0 * _DEADLINE, _DRAW, str(mesh_folder), str(new_folder))
 
 
 def _answer(what: str, path: Path, deadline: float, *words: str) -> dict[str, Any]:
@@ -161,13 +161,15 @@ def _require_own_meshes(source: Path) -> None:
     source.write_text(ET.tostring(robot, encoding="unicode"), encoding="utf-8")
 
 
-def main(words: list[str]) -> int:
+def main(arguments: list[str]) -> int:
     """Judge, draw or describe the file named first, memory and time of this process bounded; print JSON, return 0."""
-    if words[1:2] == [_NEW]:
-        return answer_within(MOST_MEMORY, _NEW_SECONDS, lambda: _new_document(Path(words[0]), words[2]))
-    if words[1:2] == [_DRAW]:
-        return answer_within(MOST_MEMORY, _NEW_SECONDS, lambda: _drawn_document(*map(Path, (words[0], *words[2:]))))
-    return answer_within(MOST_MEMORY, MOST_SECONDS, lambda: _document(words[0]))
+    if arguments[1:2] == [_NEW]:
+        return answer_within(MOST_MEMORY, _NEW_SECONDS, lambda: _new_document(Path(arguments[0]), arguments[2]))
+    if arguments[1:2] == [_DRAW]:
+        return answer_within(
+            MOST_MEMORY, _NEW_SECONDS, lambda: _drawn_document(*map(Path, (arguments[0], *arguments[2:])))
+        )
+    return answer_within(MOST_MEMORY, MOST_SECONDS, lambda: _document(arguments[0]))
 
 
 if __name__ == "__main__":

@@ -50,7 +50,7 @@ def _finding(one: Mapping[str, Any]) -> str:
     return f"{one['what']} ({one['sigma']:.1f} sigma{size}): {one['meaning']}"
 
 
-def raise_alarm(db: Database, arm: str, reidentification: str, run: str, what: str, now: float) -> None:
+def raise_alarm(db: Database, arm: str, reidentification: str, run: str, findings: str, now: float) -> None:
     """Write a new open drift alarm into the registry and the audit trail.
 
     Args:
@@ -58,18 +58,18 @@ def raise_alarm(db: Database, arm: str, reidentification: str, run: str, what: s
         arm: name.
         reidentification: id; empty where a fleet shows the change.
         run: id of the run that differs from the accepted set, or of the fleet's results.
-        what: the findings, in words.
+        findings: the findings, in words.
         now: s since 1970 in UTC.
     """
     with db.transaction():
         db.write(
             "INSERT INTO alarms (arm, reidentification, run, what, at) VALUES (?, ?, ?, ?, ?)",
-            *(arm, reidentification, run, what, now),
+            *(arm, reidentification, run, findings, now),
         )
-        note(db, "service", "drift alarm", arm, run=run, found=what)
+        note(db, "service", "drift alarm", arm, run=run, found=findings)
 
 
-def raise_fleet_alarms(db: Database, document: Mapping[str, Any], made: str, now: float) -> None:
+def raise_fleet_alarms(db: Database, document: Mapping[str, Any], results_id: str, now: float) -> None:
     """Raise an alarm for each change in a fleet unless one for it is open or was raised since the change.
 
     An alarm is for the change if it is of that arm and group, and is open or was raised after the change. What goes on
@@ -78,7 +78,7 @@ def raise_fleet_alarms(db: Database, document: Mapping[str, Any], made: str, now
     Args:
         db: the registry.
         document: `fleet.json`.
-        made: id of the fleet's results.
+        results_id: id of the fleet's results.
         now: s since 1970 in UTC.
     """
     with db.transaction():
@@ -93,13 +93,13 @@ def raise_fleet_alarms(db: Database, document: Mapping[str, Any], made: str, now
                 f"{one['until'][:10]}, {100.0 * one['torque_share']:.2g} % of the torque of joint {one['joint']}, "
                 f"{one['sigma']:.1f} sigma"
             )
-            raise_alarm(db, one["arm"], "", made, words, now)
+            raise_alarm(db, one["arm"], "", results_id, words, now)
 
 
 def alarms(
     db: Database, arm: str | None = None, *, closed: bool = False, before: int | None = None, most: int = 100
 ) -> list[Row]:
-    """Return open alarms, or `closed` ones too, the newest first, from the one before the number `before`."""
+    """Return at most `most` open alarms, or `closed` ones too, the newest first, only those numbered below `before`."""
     return db.rows(
         "SELECT * FROM alarms WHERE (? IS NULL OR arm = ?) AND (? OR closed IS NULL) AND id < ? "
         "ORDER BY id DESC LIMIT ?",
@@ -107,7 +107,7 @@ def alarms(
     )
 
 
-def acknowledge_alarm(db: Database, number: int, remark: str, by: str, now: float) -> Row:
+def acknowledge_alarm(db: Database, alarm_number: int, remark: str, by: str, now: float) -> Row:
     """Close an open alarm with the remark of a person who acknowledges it; return its row.
 
     Raises:
@@ -118,14 +118,16 @@ def acknowledge_alarm(db: Database, number: int, remark: str, by: str, now: floa
     if not remark or len(remark) > LONGEST_NOTE:
         raise UsageError(f"describe what was found in a note of 1 to {LONGEST_NOTE} characters")
     with db.transaction():
-        row = db.row("SELECT * FROM alarms WHERE id = ? AND closed IS NULL", number)
+        row = db.row("SELECT * FROM alarms WHERE id = ? AND closed IS NULL", alarm_number)
         if row is None:
-            raise UnknownId(f"no open alarm {number}; see the list of alarms")
-        db.write("UPDATE alarms SET closed = ?, closed_by = ?, how = ? WHERE id = ?", now, by, remark, number)
-        note(db, by, "alarm acknowledged", row["arm"], alarm=number, note=remark)
-    return db.rows("SELECT * FROM alarms WHERE id = ?", number)[0]
+            raise UnknownId(f"no open alarm {alarm_number}; see the list of alarms")
+        db.write("UPDATE alarms SET closed = ?, closed_by = ?, how = ? WHERE id = ?", now, by, remark, alarm_number)
+        note(db, by, "alarm acknowledged", row["arm"], alarm=alarm_number, note=remark)
+    return db.rows("SELECT * FROM alarms WHERE id = ?", alarm_number)[0]
 
 
-def end_alarms(db: Database, arm: str, how: str, by: str, now: float) -> None:
-    """Close all open alarms of an arm: its accepted set has been replaced, as `how` says."""
-    db.write("UPDATE alarms SET closed = ?, closed_by = ?, how = ? WHERE arm = ? AND closed IS NULL", now, by, how, arm)
+def end_alarms(db: Database, arm: str, reason: str, by: str, now: float) -> None:
+    """Close all open alarms of an arm: its accepted set has been replaced, as `reason` says."""
+    db.write(
+        "UPDATE alarms SET closed = ?, closed_by = ?, how = ? WHERE arm = ? AND closed IS NULL", now, by, reason, arm
+    )

@@ -132,12 +132,12 @@ def _fixed(sheet: DataSheet) -> frozenset[int]:
     return frozenset(key for key, entry in sheet.entries.items() if not entry.writable)
 
 
-def require_drives(config: ArmConfig, why: str = "only CANopen drives are configured") -> CanopenDriver:
-    """Return the `driver` section of an arm if it is CANopen; else raise UsageError with the words `why`."""
+def require_drives(config: ArmConfig, refusal: str = "only CANopen drives are configured") -> CanopenDriver:
+    """Return the `driver` section of an arm if it is CANopen; else raise UsageError with the words `refusal`."""
     if isinstance(config.driver, CanopenDriver):
         return config.driver
     kind = "no driver" if config.driver is None else f"driver {config.driver.kind!r}"
-    raise UsageError(f"{config.name} has {kind}; {why} (driver.kind: canopen)")
+    raise UsageError(f"{config.name} has {kind}; {refusal} (driver.kind: canopen)")
 
 
 _NUMBERS = {1: Kind.U8, 2: Kind.I8, 3: Kind.I16, 4: Kind.I32, 5: Kind.U8, 6: Kind.U16, 7: Kind.U32}  # CiA 301, table 44
@@ -414,10 +414,10 @@ def store_or_restore(
     return tuple(done)
 
 
-def imported_text(config: ArmConfig, found: Sequence[ImportedDrive], *, dry: bool) -> str:
+def imported_text(config: ArmConfig, imported: Sequence[ImportedDrive], *, dry: bool) -> str:
     """Format what an import has changed, or would change, in each drive as text, with a last line break."""
     lines = [f"{config.name}: {'what importing would change; nothing was written' if dry else 'imported'}"]
-    for one in found:
+    for one in imported:
         lines += ["", f"drive {one.drive}, node {one.node}, by {one.file}: {len(one.changes)} entries changed"]
         lines += [*_change_lines(one.changes)]
         lines += [f"  {'left out':<16}{_listed(one.left_out)}"] if one.left_out else []
@@ -425,9 +425,9 @@ def imported_text(config: ArmConfig, found: Sequence[ImportedDrive], *, dry: boo
     return "\n".join(lines) + "\n"
 
 
-def planned_text(config: ArmConfig, planned: Sequence[PlannedDrive], what: str = "opening") -> str:
+def planned_text(config: ArmConfig, planned: Sequence[PlannedDrive], action: str = "opening") -> str:
     """Format what an action, named in words, would write into each drive as text, with a last line break."""
-    lines = [f"{config.name}: what {what} would write; nothing was written, and nothing moved"]
+    lines = [f"{config.name}: what {action} would write; nothing was written, and nothing moved"]
     for one in planned:
         lines += ["", f"drive {one.drive}, node {one.node}: {_count(one)}", *_change_lines(one.changes)]
         lines += [f"  {'REFUSED':<16}{one.refused}"] if one.refused else []

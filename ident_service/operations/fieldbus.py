@@ -76,11 +76,11 @@ def bus_load(config: ArmConfig, rate: float | None = None) -> Budget:
     return found
 
 
-def require_budget(arm: str | Path, config: ArmConfig) -> Budget | None:
+def require_budget(description: str | Path, config: ArmConfig) -> Budget | None:
     """Return the bus budget of an arm with drives on CAN, or None for other arms; raise ConfigError if it does not fit.
 
     Args:
-        arm: file of the description, or name of a shipped one.
+        description: file of the description, or name of a shipped one.
         config: content of the description.
 
     Raises:
@@ -90,39 +90,39 @@ def require_budget(arm: str | Path, config: ArmConfig) -> Budget | None:
         return None
     found = bus_load(config)
     if not found.fits:
-        raise config_error(arm, ("driver",), f"{found.reason}. {found.remedy}")
+        raise config_error(description, ("driver",), f"{found.reason}. {found.remedy}")
     return found
 
 
-def bus_lines(found: Budget) -> str:
+def bus_lines(budget: Budget) -> str:
     """Format load and highest rate of each bus as one line a bus."""
     return "".join(
         f"bus {bus.number} ({bus.bus.channel}): {100 * bus.load.worst:.1f} % worst,"
-        f" {100 * bus.load.typical:.1f} % typical at {found.rate:g} Hz; up to {bus.highest_rate} Hz\n"
-        for bus in found.buses
+        f" {100 * bus.load.typical:.1f} % typical at {budget.rate:g} Hz; up to {bus.highest_rate} Hz\n"
+        for bus in budget.buses
     )
 
 
-def bus_text(name: str, found: Budget) -> str:
+def bus_text(arm_name: str, budget: Budget) -> str:
     """Format whether the budget fits, the load of each bus and remedies as text, with a last line break."""
-    lines = [f"{name} at {found.rate:g} Hz: {'fits' if found.fits else 'DOES NOT FIT'}"]
-    for bus in found.buses:
+    lines = [f"{arm_name} at {budget.rate:g} Hz: {'fits' if budget.fits else 'DOES NOT FIT'}"]
+    for bus in budget.buses:
         lines += ["", *_bus_lines(bus)]
-    if not found.fits:
-        lines += ["", f"{found.reason}.", "Any of these helps:", *(f"  - {remedy}" for remedy in found.remedies)]
+    if not budget.fits:
+        lines += ["", f"{budget.reason}.", "Any of these helps:", *(f"  - {remedy}" for remedy in budget.remedies)]
     return "\n".join(lines) + "\n"
 
 
-def bus_document(name: str, found: Budget) -> dict[str, Any]:
+def bus_document(arm_name: str, budget: Budget) -> dict[str, Any]:
     """Return the budget as JSON values."""
     return {
-        "arm": name,
-        "rate": found.rate,
-        "fits": found.fits,
-        "highest_rate": found.highest_rate,
-        "reason": found.reason,
-        "remedies": list(found.remedies),
-        "buses": [_bus_document(bus) for bus in found.buses],
+        "arm": arm_name,
+        "rate": budget.rate,
+        "fits": budget.fits,
+        "highest_rate": budget.highest_rate,
+        "reason": budget.reason,
+        "remedies": list(budget.remedies),
+        "buses": [_bus_document(bus) for bus in budget.buses],
     }
 
 
@@ -274,14 +274,14 @@ def _judged(node: FoundNode | None, drive: CanopenDrive) -> tuple[Match, str]:
     return Match.CONFIGURED, ""
 
 
-def scan_text(config: ArmConfig, found: Scan) -> str:
+def scan_text(config: ArmConfig, scan: Scan) -> str:
     """Format a scan as text, with a last line break."""
-    lines = [f"{config.name}: {_verdict(found)}"]
+    lines = [f"{config.name}: {_verdict(scan)}"]
     assert isinstance(config.driver, CanopenDriver)  # noqa: S101 - bus_scan has seen to it
     for number, bus in enumerate(config.driver.buses):
         lines += ["", f"bus {number}: {bus.interface} {bus.channel}, {bus.bitrate / 1e6:g} Mbit/s"]
         lines.append(f"  {'node':>4}  {'drive':<6}{'configuration':<17}{'drive state':<28}NMT state")
-        for line in found.lines:
+        for line in scan.lines:
             if line.bus == number:
                 lines += _node_lines(line)
     return "\n".join(lines) + "\n"
@@ -320,12 +320,12 @@ def _node_lines(line: ScannedNode) -> Iterator[str]:
         yield f"{'':8}{words}"
 
 
-def scan_document(config: ArmConfig, found: Scan) -> dict[str, Any]:
+def scan_document(config: ArmConfig, scan: Scan) -> dict[str, Any]:
     """Return a scan as JSON values."""
     return {
         "arm": config.name,
-        "complete": found.complete,
-        "nodes": [_node_document(line) for line in found.lines],
+        "complete": scan.complete,
+        "nodes": [_node_document(line) for line in scan.lines],
     }
 
 
@@ -408,14 +408,14 @@ class Probe:
 
 def bus_probe(
     config: ArmConfig,
-    files: Sequence[TextFile] = (),
+    data_sheets: Sequence[TextFile] = (),
     open_bus: Callable[[ArmConfig], list[Link]] = open_links,
 ) -> Probe:
-    """Read what an arm's drives can do, or what the data sheets `files` say, and judge it; nothing is changed.
+    """Read what an arm's drives can do, or what `data_sheets` (EDS or DCF texts) say, and judge it; nothing is changed.
 
     Args:
         config: the arm's.
-        files: data sheets, judged in place of the drives without any bus.
+        data_sheets: data sheets, judged in place of the drives without any bus.
         open_bus: function that opens the links, in the order of the buses.
 
     Raises:
@@ -423,8 +423,8 @@ def bus_probe(
         DriverError: a bus is in use, by another host too, cannot be opened, or is lost.
     """
     driver = require_drives(config, "a bus probe is of CANopen drives")
-    if files:
-        probed = [_of_file(driver, number % len(driver.drives), one) for number, one in enumerate(files)]
+    if data_sheets:
+        probed = [_of_file(driver, number % len(driver.drives), one) for number, one in enumerate(data_sheets)]
     else:
         with asking(config, open_bus) as (_, links, heard):
             probed = []
@@ -437,7 +437,7 @@ def bus_probe(
         for frames in ("shared", "single")
     }
     shares = all(one.can is not None and one.can.shares for one in probed)
-    return Probe(tuple(probed), shares, rates, bus_profiles(driver, rate)[0].status_syncs, bool(files))
+    return Probe(tuple(probed), shares, rates, bus_profiles(driver, rate)[0].status_syncs, bool(data_sheets))
 
 
 def _of_drive(driver: CanopenDriver, number: int, objects: Objects) -> Probed:
@@ -487,31 +487,31 @@ def cut_sheets(config: ArmConfig) -> tuple[str, ...]:
     return tuple(f"{name} seems to end too early: {why}; get the whole file" for name, why in found if why)
 
 
-def probe_text(config: ArmConfig, found: Probe) -> str:
+def probe_text(config: ArmConfig, probe: Probe) -> str:
     """Format a probe as text, with a last line break."""
-    bad = [one for one in found.probed if not one.drivable]
-    verdict = f"{len(bad)} of {len(found.probed)} NOT as described" if bad else "every drive can be driven"
+    bad = [one for one in probe.probed if not one.drivable]
+    verdict = f"{len(bad)} of {len(probe.probed)} NOT as described" if bad else "every drive can be driven"
     lines = [f"{config.name}: {verdict}; nothing was written"]
-    for one in found.probed:
-        lines += ["", *_lines(one, found)]
-    frames = "shared" if found.shares else "single"
-    if all(one.can is not None and not one.can.problems for one in found.probed):
-        lines += ["", f"highest rate: {found.highest_rate} Hz, with {frames} torque frames (driver.torque_frames)"]
-        if found.shares:
-            lines.append(f"with single ones: {found.rates['single']} Hz")
-        if config.control.rate > found.highest_rate:
+    for one in probe.probed:
+        lines += ["", *_lines(one, probe)]
+    frames = "shared" if probe.shares else "single"
+    if all(one.can is not None and not one.can.problems for one in probe.probed):
+        lines += ["", f"highest rate: {probe.highest_rate} Hz, with {frames} torque frames (driver.torque_frames)"]
+        if probe.shares:
+            lines.append(f"with single ones: {probe.rates['single']} Hz")
+        if config.control.rate > probe.highest_rate:
             lines.append(f"control.rate is {config.control.rate:g} Hz, which is TOO MUCH")
-    if advice := probe_advice(found):
+    if advice := probe_advice(probe):
         lines += ["", "what helps:", *(f"  {line}" for line in advice)]
     return "\n".join(lines) + "\n"
 
 
-def probe_advice(found: Probe) -> list[str]:
+def probe_advice(probe: Probe) -> list[str]:
     """Return what helps where drives or files cannot be driven as described, one sentence for all that are alike."""
     advice: dict[str, list[str]] = {}
-    for one in found.probed:
+    for one in probe.probed:
         if not one.drivable:
-            advice.setdefault(_advice(one, found), []).append(one.title)
+            advice.setdefault(_advice(one, probe), []).append(one.title)
     return [f"{', '.join(titles)}: {words}" for words, titles in advice.items()]
 
 
@@ -592,16 +592,16 @@ def _capability_rows(one: Probed, found: Probe) -> dict[str, str]:
     return facts
 
 
-def probe_document(config: ArmConfig, found: Probe) -> dict[str, Any]:
+def probe_document(config: ArmConfig, probe: Probe) -> dict[str, Any]:
     """Return a probe as JSON values."""
     return {
         "arm": config.name,
-        "good": found.good,
-        "shares": found.shares,
-        "rates": found.rates,
-        "highest_rate": found.highest_rate,
-        "advice": probe_advice(found),
-        "drives": [_document(one, found) for one in found.probed],
+        "good": probe.good,
+        "shares": probe.shares,
+        "rates": probe.rates,
+        "highest_rate": probe.highest_rate,
+        "advice": probe_advice(probe),
+        "drives": [_document(one, probe) for one in probe.probed],
     }
 
 
@@ -641,23 +641,23 @@ FILE = "drives.json"  # in an arm's folder
 _KEPT_FORMAT = "ident-drives"
 
 
-def keep_outcome(path: Path, document: dict[str, Any]) -> list[str]:
+def store_probe_outcome(probe_file: Path, document: dict[str, Any]) -> list[str]:
     """Store in a file what a probe found of an arm's drives; return what differs from the probe before, in words.
 
     Args:
-        path: of the file, one for each arm.
+        probe_file: the file, one for each arm.
         document: `probe_document` of drives that were asked; those that did not answer keep what was known of them.
 
     Raises:
         UsageError: the file was damaged by somebody.
     """
     try:
-        before = json.loads(path.read_text(encoding="utf-8"))
+        before = json.loads(probe_file.read_text(encoding="utf-8"))
         known = dict(before["drives"]) if before["format"] == _KEPT_FORMAT else {}
     except FileNotFoundError:
         known = {}
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UsageError(f"{path}: cannot be read ({error}); remove the file, and probe again") from None
+        raise UsageError(f"{probe_file}: cannot be read ({error}); remove the file, and probe again") from None
     now = datetime.now(UTC).isoformat(timespec="seconds")
     words = list[str]()
     for one in document["drives"]:
@@ -667,8 +667,8 @@ def keep_outcome(path: Path, document: dict[str, Any]) -> list[str]:
         if old is not None:
             words += [f"{place}: {what} (probe of {old['when']})" for what in _different(old["can"], one["can"])]
         known[one["title"]] = {"when": now, "node": one["node"], "can": one["can"]}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, json.dumps({"format": _KEPT_FORMAT, "version": 1, "drives": known}, indent=1) + "\n")
+    probe_file.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(probe_file, json.dumps({"format": _KEPT_FORMAT, "version": 1, "drives": known}, indent=1) + "\n")
     return words
 
 
@@ -701,9 +701,9 @@ _OF_A_DRIVE = (
 
 def bus_report(
     config: ArmConfig,
-    path: Path,
-    ticket: Path | None = None,
-    frames: Path | None = None,
+    report_file: Path,
+    ticket_file: Path | None = None,
+    frame_log: Path | None = None,
     open_bus: Callable[[ArmConfig], list[Link]] = open_links,
 ) -> list[str]:
     """Write a ZIP file to find out why drives do not work, without secrets and names; return its files' names.
@@ -712,9 +712,9 @@ def bus_report(
 
     Args:
         config: of the arm.
-        path: of the file, which must not exist.
-        ticket: ticket of the last preflight, left out where the file does not exist.
-        frames: a log of frames of a run, likewise.
+        report_file: the ZIP file, which must not exist.
+        ticket_file: ticket of the last preflight, left out where the file does not exist.
+        frame_log: a log of frames of a run, likewise.
         open_bus: function that opens the links, in the order of the buses.
 
     Returns:
@@ -724,12 +724,12 @@ def bus_report(
         UsageError: no CANopen drives, the file exists, or it cannot be written.
     """
     driver = require_drives(config, "a report is of CANopen drives")
-    if path.exists():
-        raise UsageError(f"{path} exists; give another name")
+    if report_file.exists():
+        raise UsageError(f"{report_file} exists; give another name")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        report_file.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
+        raise UsageError(f"{report_file}: cannot be written: {error.strerror}") from None
     found: dict[str, str] = {
         "versions.json": _as_json(_versions()),
         "description.json": _as_json(_description(config, driver)),
@@ -739,18 +739,22 @@ def bus_report(
             found[f"{name}.txt"] = text
             if document is not None:
                 found[f"{name}.json"] = _as_json(document)
-        for name, file in (("probe.log", Path(folder) / "probe.log"), ("ticket.json", ticket), ("can.log", frames)):
+        for name, file in (
+            ("probe.log", Path(folder) / "probe.log"),
+            ("ticket.json", ticket_file),
+            ("can.log", frame_log),
+        ):
             if file is not None and file.is_file():
                 found[name] = file.read_text(encoding="utf-8", errors="replace")
-    part = path.with_name(f".{path.name}.part")
+    part = report_file.with_name(f".{report_file.name}.part")
     try:
         with ZipFile(part, "x", ZIP_DEFLATED) as archive:
             for name, text in found.items():
                 archive.writestr(name, text)
-        part.replace(path)
+        part.replace(report_file)
     except OSError as error:
         part.unlink(missing_ok=True)
-        raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
+        raise UsageError(f"{report_file}: cannot be written: {error.strerror}") from None
     return sorted(found)
 
 

@@ -224,11 +224,11 @@ _SLOWEST = 5.0  # Hz; nobody samples an arm more slowly
 _AT_REST = 0.99  # share of the time at standstill of a recording that shows nothing
 
 
-def custom_of(arm: str, config: ArmConfig) -> CustomFunction | None:
-    """Load the function that a description names as `constraints.custom`; None where it names none.
+def custom_of(description: str, config: ArmConfig) -> CustomFunction | None:
+    """Load the function that a description, file or shipped name, names as `constraints.custom`; None where none.
 
     Args:
-        arm: description file or name of a shipped one.
+        description: description file or name of a shipped one.
         config: content of the description.
 
     Raises:
@@ -238,17 +238,17 @@ def custom_of(arm: str, config: ArmConfig) -> CustomFunction | None:
     if name is None:
         return None
     try:
-        return load_custom(name, folder_of(arm, CUSTOM))
+        return load_custom(name, folder_of(description, CUSTOM))
     except CustomError as error:
-        raise config_error(arm, CUSTOM, str(error)) from error
+        raise config_error(description, CUSTOM, str(error)) from error
 
 
-def unusable_because(estimate: Estimate, found: Sequence[tuple[Recording, Quality]]) -> Objections:
+def unusable_because(estimate: Estimate, qualities: Sequence[tuple[Recording, Quality]]) -> Objections:
     """Return the reasons, from its recordings and its errors, why an estimate must not be used."""
     model = estimate.model
-    seen = (reasons_in_recording(recording.path.name, one.joints, model) for recording, one in found)
+    seen = (reasons_in_recording(recording.path.name, one.joints, model) for recording, one in qualities)
     names = set(estimate.recordings)
-    fitted = [(recording, one) for recording, one in found if (recording.path.name, recording.sha256) in names]
+    fitted = [(recording, one) for recording, one in qualities if (recording.path.name, recording.sha256) in names]
     seconds = sum(one.duration_s for _, one in fitted)
     wrong = (reason for reasons in seen for reason in reasons)
     # Without a joint's torque every reading of the others is as wrong.

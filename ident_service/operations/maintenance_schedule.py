@@ -38,13 +38,13 @@ class Cron:
 
     text: str
 
-    def after(self, at: float) -> float:
-        """Return the first time after `at` that the five fields match; both [s since 1970 in UTC].
+    def after(self, seconds: float) -> float:
+        """Return the first time after `seconds` that the five fields match; both [s since 1970 in UTC].
 
         Raises:
             UsageError: no such day comes within fifty years.
         """
-        found = next(CronSim(self.text, datetime.fromtimestamp(at, UTC)), None)
+        found = next(CronSim(self.text, datetime.fromtimestamp(seconds, UTC)), None)
         if found is None:
             raise UsageError(f"{self.text!r}: there is no such day")
         return found.timestamp()
@@ -137,55 +137,55 @@ def schedules(db: Database, arm: str | None = None) -> list[Row]:
     return [{**row, "motion": json.loads(row["request"]).get("motion")} for row in rows]
 
 
-def known_schedule(db: Database, number: int) -> Row:
+def known_schedule(db: Database, schedule_number: int) -> Row:
     """Return the row of the schedule of this number; raise UnknownId where there is none.
 
     Raises:
         UnknownId: there is none.
     """
-    found = [row for row in schedules(db) if row["id"] == number]
+    found = [row for row in schedules(db) if row["id"] == schedule_number]
     if not found:
-        raise UnknownId(f"no schedule {number} is known; see the list of schedules")
+        raise UnknownId(f"no schedule {schedule_number} is known; see the list of schedules")
     return found[0]
 
 
-def enable_schedule(db: Database, number: int, by: str, now: float, *, enabled: bool) -> Row:
+def enable_schedule(db: Database, schedule_number: int, by: str, now: float, *, enabled: bool) -> Row:
     """Enable a schedule from now on, or disable it; what is already due by it stays due.
 
     Raises:
         UnknownId: there is none.
     """
     with db.transaction():
-        row = known_schedule(db, number)
+        row = known_schedule(db, schedule_number)
         if bool(row["enabled"]) is not enabled:
             following = parse_cron(row["cron"]).after(now) if row["cron"] and enabled else row["next"]
             db.write(
                 "UPDATE schedules SET enabled = ?, next = ?, counted = ? WHERE id = ?",
-                *(int(enabled), following, operating_seconds(db, row["arm"]), number),
+                *(int(enabled), following, operating_seconds(db, row["arm"]), schedule_number),
             )
-            note(db, by, "schedule enabled" if enabled else "schedule disabled", row["arm"], schedule=number)
-    return known_schedule(db, number)
+            note(db, by, "schedule enabled" if enabled else "schedule disabled", row["arm"], schedule=schedule_number)
+    return known_schedule(db, schedule_number)
 
 
-def remove_schedule(db: Database, number: int, by: str) -> None:
+def remove_schedule(db: Database, schedule_number: int, by: str) -> None:
     """Remove a schedule; what is already due by it stays due.
 
     Raises:
         UnknownId: there is none.
     """
     with db.transaction():
-        row = known_schedule(db, number)
-        db.write("DELETE FROM schedules WHERE id = ?", number)
-        note(db, by, "schedule removed", row["arm"], schedule=number, when=row["cron"] or row["trigger"])
+        row = known_schedule(db, schedule_number)
+        db.write("DELETE FROM schedules WHERE id = ?", schedule_number)
+        note(db, by, "schedule removed", row["arm"], schedule=schedule_number, when=row["cron"] or row["trigger"])
 
 
-def add_event(db: Database, arm: str, what: str, remark: str, by: str, now: float) -> Row:
+def add_event(db: Database, arm: str, work_done: str, remark: str, by: str, now: float) -> Row:
     """Enter maintenance that was done, mark the schedules that follow maintenance as due, return the event's row.
 
     Args:
         db: the registry.
         arm: name of an arm that it knows.
-        what: what was done, in a few words.
+        work_done: what was done, in a few words.
         remark: further remark; may be empty.
         by: name of the person who reports it.
         now: s since 1970 in UTC.
@@ -193,23 +193,23 @@ def add_event(db: Database, arm: str, what: str, remark: str, by: str, now: floa
     Raises:
         UsageError: nothing was said, or too much.
     """
-    what, remark = what.strip(), remark.strip()
-    if not what or len(what) > LONGEST_WHAT or len(remark) > LONGEST_NOTE:
+    work_done, remark = work_done.strip(), remark.strip()
+    if not work_done or len(work_done) > LONGEST_WHAT or len(remark) > LONGEST_NOTE:
         raise UsageError(f"describe what was done in 1 to {LONGEST_WHAT} characters; a note has {LONGEST_NOTE} at most")
     with db.transaction():
         db.write(
             "INSERT INTO maintenance_events (arm, what, note, at, who) VALUES (?, ?, ?, ?, ?)",
-            *(arm, what, remark, now, by),
+            *(arm, work_done, remark, now, by),
         )
-        note(db, by, "maintenance", arm, done=what)
+        note(db, by, "maintenance", arm, done=work_done)
         for row in schedules(db, arm):
             if row["enabled"] and row["trigger"] == MAINTENANCE:
-                _falls_due(db, row, f"maintenance: {what}", now)
+                _falls_due(db, row, f"maintenance: {work_done}", now)
     return events(db, arm, most=1)[0]
 
 
 def events(db: Database, arm: str, *, before: int | None = None, most: int = 100) -> list[Row]:
-    """Return the maintenance of an arm, the newest first, from the event before the number `before`."""
+    """Return at most `most` maintenance events of an arm, the newest first, only those numbered below `before`."""
     last = 2**62 if before is None else before
     return db.rows(
         "SELECT * FROM maintenance_events WHERE arm = ? AND id < ? ORDER BY id DESC LIMIT ?", arm, last, most
@@ -269,27 +269,27 @@ def pending_with_accepted(db: Database, state: Path, arm: str | None = None) -> 
     return [{**row, "accepted": bool(acceptances(state, row["arm"]))} for row in pending(db, arm)]
 
 
-def dismiss(db: Database, number: int, why: str, by: str, now: float) -> None:
+def dismiss(db: Database, due_number: int, reason: str, by: str, now: float) -> None:
     """Close a due entry that is not to be done, on a person's decision.
 
     Raises:
         UsageError: no reason, or too long a one.
         UnknownId: no such entry is due.
     """
-    why = why.strip()
-    if not why or len(why) > LONGEST_NOTE:
+    reason = reason.strip()
+    if not reason or len(reason) > LONGEST_NOTE:
         raise UsageError(f"give the reason, in 1 to {LONGEST_NOTE} characters")
     with db.transaction():
-        row = db.row("SELECT arm FROM dues WHERE id = ? AND closed IS NULL", number)
+        row = db.row("SELECT arm FROM dues WHERE id = ? AND closed IS NULL", due_number)
         if row is None:
-            raise UnknownId(f"nothing of number {number} is due; see the list of due entries")
-        db.write("UPDATE dues SET closed = ?, closed_by = ?, how = ? WHERE id = ?", now, by, why, number)
-        note(db, by, "due dismissed", row["arm"], due=number, note=why)
+            raise UnknownId(f"nothing of number {due_number} is due; see the list of due entries")
+        db.write("UPDATE dues SET closed = ?, closed_by = ?, how = ? WHERE id = ?", now, by, reason, due_number)
+        note(db, by, "due dismissed", row["arm"], due=due_number, note=reason)
 
 
-def close_dues(db: Database, arm: str, before: float, how: str, by: str, now: float) -> None:
-    """Close an arm's entries that were due by `before` [s since 1970 in UTC], because a re-identification did them."""
+def close_dues(db: Database, arm: str, due_until: float, reason: str, by: str, now: float) -> None:
+    """Close an arm's entries due until `due_until` [s since 1970 in UTC], because a re-identification did them."""
     db.write(
         "UPDATE dues SET closed = ?, closed_by = ?, how = ? WHERE arm = ? AND at <= ? AND closed IS NULL",
-        *(now, by, how, arm, before),
+        *(now, by, reason, arm, due_until),
     )

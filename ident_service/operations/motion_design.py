@@ -33,7 +33,7 @@ from ident_service.operations.motion_preview import Preview, preview, preview_do
 from ident_service.operations.recordings import open_together
 from ident_service.preflight.stability import delay_of, stability
 from ident_service.recordings.adapters import overlap
-from ident_service.results.manifest import atomic_folder, require_place, write_atomically
+from ident_service.results.manifest import atomic_folder, require_writable_place, write_atomically
 from ident_service.results.motion_figures import MotionTraces, joints_over_time
 from ident_service.results.parameter_file import read_parameters
 from ident_service.results.posture_figure import Closest, Postures, stick_figure
@@ -156,7 +156,7 @@ def design_files(
         MotionRefused: limits that contradict each other, home in collision, no posture that keeps them.
         RecordingError, ParameterError: a file of the knowledge cannot be used.
     """
-    require_place(folder)
+    require_writable_place(folder)
     if (folder / MOTION).exists():
         raise UsageError(f"{folder / MOTION}: exists already; give another folder")
     model = known_model(request.arm, request.knowledge)
@@ -196,12 +196,12 @@ def design_files(
     return designed, seen
 
 
-def preview_files(arm: str, motion: Path | None, knowledge: PriorData, folder: Path | None) -> Preview:
+def preview_files(description: str, motion_file: Path | None, knowledge: PriorData, folder: Path | None) -> Preview:
     """Predict how a motion goes and what it teaches, and return it; write text, values and drawings if given a folder.
 
     Args:
-        arm: description file, or the name of a shipped one.
-        motion: file of the motion; the description's own identification motion when None.
+        description: description file, or the name of a shipped one.
+        motion_file: file of the motion; the description's own identification motion when None.
         knowledge: beside the description.
         folder: folder of the text and the drawings; others in it stay.
 
@@ -209,8 +209,8 @@ def preview_files(arm: str, motion: Path | None, knowledge: PriorData, folder: P
         UsageError, ConfigError: a file that does not exist or is not valid.
         MotionRefused: the motion was made for another arm.
     """
-    model = known_model(arm, knowledge)
-    chosen = excitation(model, "identification", checked=False) if motion is None else read_excitation(motion)
+    model = known_model(description, knowledge)
+    chosen = excitation(model, "identification", checked=False) if motion_file is None else read_excitation(motion_file)
     seen = _previewed(model, chosen, knowledge)
     if folder is not None:
         with atomic_folder(folder) as staging:
@@ -226,13 +226,13 @@ def write_preview(folder: Path, seen: Preview) -> None:
         write_atomically(folder / name, text)
 
 
-def known_model(arm: str, knowledge: PriorData) -> ArmModel:
-    """Return the arm's model, its prior from the knowledge's parameter file if given; UsageError if of another arm.
+def known_model(description: str, knowledge: PriorData) -> ArmModel:
+    """Load a description (file or shipped name) into a model, its prior from the knowledge's parameter file if given.
 
     Raises:
         UsageError: the parameter file has no link parameters of this arm.
     """
-    model = arm_model(load_arm(arm))
+    model = arm_model(load_arm(description))
     if knowledge.parameters is None:
         return model
     table = read_parameters(knowledge.parameters, model.layout.names).content.get("link_parameters")

@@ -80,7 +80,7 @@ class Preview:
 
 
 def preview(
-    model: ArmModel, excitation: Excitation, noise: NoiseModel | None = None, added: Array | None = None
+    model: ArmModel, excitation: Excitation, noise: NoiseModel | None = None, earlier_information: Array | None = None
 ) -> Preview:
     """Predict peaks, clearances, stops and deviations of a motion, and list what forbids it; nothing moves.
 
@@ -88,7 +88,7 @@ def preview(
         model: of the arm, with prior parameters.
         excitation: motion that was made for this arm.
         noise: noise of the torques; the description's when None.
-        added: information from earlier recordings, whitened by `noise`, shape (base, base).
+        earlier_information: information from earlier recordings, whitened by `noise`, shape (base, base).
 
     Raises:
         MotionRefused: the motion was made for another arm, or the arm's description lacks limits.
@@ -139,7 +139,7 @@ def preview(
         approach=(durations[0], durations[1]),
         base=base,
         noise=noise,
-        deviations=expected_deviations(path, model, base, noise, added),
+        deviations=expected_deviations(path, model, base, noise, earlier_information),
         negligible=_negligible(path, model, base, limits),
         condition_number=condition_number(information(path, model, base, np.ones(model.chain.joints))),
         warnings=tuple(_warnings(model, limits, None if proof.tracking is not None else following)),
@@ -183,7 +183,7 @@ def _following(model: ArmModel, excitation: Excitation, limits: MotionLimits) ->
     return predict_following_error(model, limits, friction, position, velocity)
 
 
-def recorded_noise(file: Path, model: ArmModel) -> NoiseModel:
+def recorded_noise(parameter_file: Path, model: ArmModel) -> NoiseModel:
     """Return the torque noise of each joint, from the residuals of an earlier identification of the arm.
 
     Per joint the residual's root mean square; and by how much the deviations found in blocks exceed those that white
@@ -192,7 +192,7 @@ def recorded_noise(file: Path, model: ArmModel) -> NoiseModel:
     Raises:
         UsageError, ParameterError: no such file, not a parameter file, or one of another arm or without a fit.
     """
-    content = read_parameters(file, model.layout.names).content
+    content = read_parameters(parameter_file, model.layout.names).content
     try:
         rows = {row["joint"]: float(row["rms"]) for row in content["fit"]["per_joint"]}
         deviation = np.array([rows[name] for name in model.chain.names])
@@ -201,12 +201,15 @@ def recorded_noise(file: Path, model: ArmModel) -> NoiseModel:
         ratios = [blocks / white for blocks, white in pairs if blocks is not None and white]
     except (KeyError, TypeError):
         raise UsageError(
-            f"{file}: no residual per joint and no standard deviations of the joints {', '.join(model.chain.names)}; "
+            f"{parameter_file}: no residual per joint and no standard deviations of the joints "
+            f"{', '.join(model.chain.names)}; "
             "give the parameters.json of an identification of this arm"
         ) from None
     if not ratios or not (deviation > 0.0).all():
-        raise UsageError(f"{file}: its residuals or standard deviations are zero, so nothing can be predicted from it")
-    return NoiseModel(deviation, float(np.exp(np.mean(np.log(ratios)))), f"the residuals in {file.name}")
+        raise UsageError(
+            f"{parameter_file}: its residuals or standard deviations are zero, so nothing can be predicted from it"
+        )
+    return NoiseModel(deviation, float(np.exp(np.mean(np.log(ratios)))), f"the residuals in {parameter_file.name}")
 
 
 def preview_document(seen: Preview) -> dict[str, Any]:

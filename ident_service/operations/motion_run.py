@@ -58,7 +58,7 @@ from ident_service.operations.arm_checks import write_ticket
 from ident_service.recordings.files import require_writable
 from ident_service.recordings.recorder import RecorderProcess
 from ident_service.registry.state_folder import arm_folder, fault_file
-from ident_service.results.manifest import require_place, write_atomically, write_manifest
+from ident_service.results.manifest import require_writable_place, write_atomically, write_manifest
 
 _RENEW_SHARE = 0.25  # of the lease
 _LAST_WORDS = 30.0  # s to wait for the result of a process that was told to stop
@@ -131,8 +131,8 @@ class ProcessResult:
 
 def supervise_motion_process(
     request: dict[str, Any],
-    ends: tuple[int, ...],
-    lease: float,
+    ring_descriptors: tuple[int, ...],
+    lease_seconds: float,
     tell: Callable[[str], None],
     stop_requested: Callable[[], bool],
     finish_requested: Callable[[], bool] = lambda: False,
@@ -141,8 +141,8 @@ def supervise_motion_process(
 
     Args:
         request: request to the motion process (`motion/process.py`).
-        ends: file descriptors of the ring, for a sink.
-        lease: how long the arm moves on when this process is gone [s].
+        ring_descriptors: file descriptors of the ring, for a sink.
+        lease_seconds: how long the arm moves on when this process is gone [s].
         tell: called with each state that is entered.
         stop_requested: called several times per lease; True stops the motion.
         finish_requested: called several times per lease, without waiting; True finishes the motion early.
@@ -157,16 +157,18 @@ def supervise_motion_process(
         bufsize=0,  # select does not see a line that waits in a buffer
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
-        pass_fds=ends,
+        pass_fds=ring_descriptors,
         env=environment,
         start_new_session=True,
     ) as process:
         if process.stdin is None or process.stdout is None:
             raise AssertionError("pipes were asked for")
         with suppress(BrokenPipeError):
-            process.stdin.write(json.dumps({**request, "ends": ends}).encode() + b"\n")
+            process.stdin.write(json.dumps({**request, "ends": ring_descriptors}).encode() + b"\n")
             process.stdin.flush()
-        watch = _Watch(process, Path(request["arm_folder"]) / CONTROLS, lease, tell, stop_requested, finish_requested)
+        watch = _Watch(
+            process, Path(request["arm_folder"]) / CONTROLS, lease_seconds, tell, stop_requested, finish_requested
+        )
         try:
             try:
                 watch.hear()
@@ -397,14 +399,14 @@ def run_motion(
     ticket: Ticket,
     *,
     speed: float = 1.0,
-    lease: float = LEASE_SECONDS,
+    lease_seconds: float = LEASE_SECONDS,
     log_frames: bool = False,
-    begin: Callable[[], None] = lambda: None,
+    on_begin: Callable[[], None] = lambda: None,
     tell: Callable[[str], None] = lambda _: None,
-    moved: Callable[[float], None] = lambda _: None,
+    on_progress: Callable[[float], None] = lambda _: None,
     stop_requested: Callable[[], bool] = lambda: False,
     requested_ns: int | None = None,
-    until: Target | None = None,
+    target: Target | None = None,
 ) -> RunResult:
     """Move an arm along a motion, or to a destination, by a valid ticket, and record it into a new folder.
 
@@ -415,15 +417,15 @@ def run_motion(
         state: the state folder, where the arm's controls and faults are.
         ticket: ticket of the preflight; the motion process compares it with the open arm.
         speed: share of the motion's own speed; motions to a destination have a fixed speed.
-        lease: how long the arm moves on when this process is gone [s].
+        lease_seconds: how long the arm moves on when this process is gone [s].
         log_frames: whether every frame of the fieldbus is kept in `can.log`, too, in candump's format.
-        begin: called when all checks that do not need the arm have passed, and the folder exists.
+        on_begin: called when all checks that do not need the arm have passed, and the folder exists.
         tell: called with each state that is entered.
-        moved: called several times a second with how long the arm has been driven, in its own time [s].
+        on_progress: called several times a second with how long the arm has been driven, in its own time [s].
         stop_requested: called several times a second; True stops the motion.
         requested_ns: time when a person asked for the motion, on the machine's monotonic clock [ns]; now when None. A
             stop that was asked for since then keeps it from beginning.
-        until: accuracy target at which the run is finished early; None for one that goes on to its end.
+        target: accuracy target at which the run is finished early; None for one that goes on to its end.
 
     Raises:
         UsageError: the run folder exists or cannot be made, the state folder cannot be written, or the target is none;
@@ -441,9 +443,9 @@ def run_motion(
     model = arm_model(config)
     subject = subject_of(model, motion if isinstance(motion, Excitation) else None, None)
     ticket.require_valid_for(ticket.with_arm(subject), datetime.now(UTC))
-    if until is not None:
-        require_target(until, model)
-    require_place(folder)
+    if target is not None:
+        require_target(target, model)
+    require_writable_place(folder)
     require_writable(arm_folder(state, config.name))
     clock = make_arm(config).clock
     try:
@@ -478,7 +480,7 @@ def run_motion(
         "recording": str(recording),
         "folder": str(folder),
         "arm_folder": str(arm_folder(state, config.name)),
-        "lease": lease,
+        "lease": lease_seconds,
         "requested_ns": requested_ns,
         "ticket": ticket.to_json(),
         "speed": speed,
@@ -487,21 +489,21 @@ def run_motion(
     started, ending = False, None
 
     def watched() -> bool:
-        moved(recorder.written / config.control.rate)
+        on_progress(recorder.written / config.control.rate)
         return stop_requested()
 
     try:
         write_ticket(folder / "ticket.json", ticket)
         for file, content in attachments.items():
             write_atomically(folder / file, content.decode() + "\n")
-        begin()
+        on_begin()
         reaching = None
-        if until is not None and isinstance(motion, Excitation):
-            reaching = TargetMonitor(folder, until, least_seconds(motion, speed), tell)
+        if target is not None and isinstance(motion, Excitation):
+            reaching = TargetMonitor(folder, target, least_seconds(motion, speed), tell)
         with recorder, reaching or nullcontext():
             started = True
             finish = (lambda: False) if reaching is None else reaching.reached
-            ending = supervise_motion_process(request, astuple(recorder.ends), lease, tell, watched, finish)
+            ending = supervise_motion_process(request, astuple(recorder.ends), lease_seconds, tell, watched, finish)
             ending.raise_for(faults)
     except BaseException as error:
         refused = isinstance(error, MotionRefused) or (ending is not None and ending.reported and not ending.taken)
@@ -511,10 +513,10 @@ def run_motion(
             shutil.rmtree(folder, ignore_errors=True)
         raise
     write_manifest(folder)
-    if reaching is None or until is None:
+    if reaching is None or target is None:
         return RunResult(folder, ending.report)
-    wanted = {"share": until.share, "parameters": list(until.parameters), "reached": reaching.output}
-    wanted["missed"] = [] if reaching.output is not None else _missed(folder, until, reaching.period, tell)
+    wanted = {"share": target.share, "parameters": list(target.parameters), "reached": reaching.output}
+    wanted["missed"] = [] if reaching.output is not None else _missed(folder, target, reaching.period, tell)
     return RunResult(folder, {**ending.report, "until": wanted})
 
 

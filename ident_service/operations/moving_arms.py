@@ -27,34 +27,34 @@ def stop_arms(state: Path, arm: str | None) -> list[str]:
 Asked = Literal["pause", "resume", "finish", "supported"]
 
 
-def ask_process(path: Path, asked: Asked) -> int:
+def ask_process(control_file: Path, request: Asked) -> int:
     """Write a request into a control file for the process that holds it, do not wait; return that process's id.
 
     Args:
-        path: of the control file.
-        asked: request: pause, or go on; finish a run early by its regular end, out of a pause too; or release an arm
+        control_file: of the control file.
+        request: request: pause, or go on; finish a run early by its regular end, out of a pause too; or release an arm
             that is held after a stop, since a person sees it supported.
 
     Raises:
         UsageError: no process holds it.
         DriverError: the file cannot be opened.
     """
-    with ControlFile.reach(path) as controls:
-        if asked == "supported":
+    with ControlFile.reach(control_file) as controls:
+        if request == "supported":
             controls.confirm_support()
         else:
-            if asked == "finish":
+            if request == "finish":
                 controls.request_finish()
-            controls.request_pause(asked == "pause")
+            controls.request_pause(request == "pause")
         return controls.pid
 
 
-def ask_arm(state: Path, arm: str, asked: Asked) -> bool:
+def ask_arm(state: Path, arm: str, request: Asked) -> bool:
     """Send a request, such as `pause`, to the process that moves or holds an arm; return whether there was one."""
-    return bool(_reach(state, arm, lambda path: ask_process(path, asked)))
+    return bool(_reach(state, arm, lambda path: ask_process(path, request)))
 
 
-def held_arm(state: Path, arm: str) -> bool:
+def is_held(state: Path, arm: str) -> bool:
     """Tell whether an arm without brakes is held after a stop until a person confirms that it is supported."""
     try:
         with ControlFile.reach(control_path(state, arm)) as controls:

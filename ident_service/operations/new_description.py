@@ -39,7 +39,7 @@ from ident_service.motion.safety_monitor import TORQUE_RATE, TORQUE_RATE_SHARE
 from ident_service.operations.commissioning import require_clear_from_home
 from ident_service.preflight.stability import LEAST_GAIN_MARGIN, delay_of, stability
 from ident_service.recordings.files import write_atomically
-from ident_service.results.manifest import require_place
+from ident_service.results.manifest import require_writable_place
 
 RATE = 500.0  # Hz, at which most arms' gains are stable and a simulation is quick
 CLEARANCE = 0.02  # m
@@ -99,9 +99,9 @@ class Draft:
     remarks: list[str] = field(default_factory=list)
 
 
-def short(value: float, digits: int = 4) -> float:
+def round_significant(value: float, significant_digits: int = 4) -> float:
     """Round a number to some significant digits."""
-    return float(f"{value:.{digits}g}")
+    return float(f"{value:.{significant_digits}g}")
 
 
 _UNITS = {
@@ -114,7 +114,7 @@ _SLIDE_UNITS = {
 }  # fmt: skip
 
 
-def in_yaml(draft: Draft, revolute: Mapping[str, bool] | None = None) -> str:
+def description_yaml(draft: Draft, revolute: Mapping[str, bool] | None = None) -> str:
     """Return the description as YAML with comments.
 
     Args:
@@ -183,7 +183,7 @@ terms: [drive_inertia, viscous, coulomb, offset]
         f"motions: # Hz; shares of the limits\n  identification: {_flow(first)}\n  validation: {_flow(second)}\n"
     )
     torque = [keys["torque"] for keys in draft.joints.values()]
-    noise, step = ([short(share * value, 2) for value in torque] for share in (2e-3, 2e-4))
+    noise, step = ([round_significant(share * value, 2) for value in torque] for share in (2e-3, 2e-4))
     driver = {
         "kind": ("simulated", "real arms: canopen, barrett or your own (docs/drivers.md)"),
         "time": ("virtual", "as fast as it can; `real` keeps the clock"),
@@ -251,10 +251,10 @@ _TOUCHES, _ALWAYS = {2: 0.3, 3: 0.6}, 0.95
 
 def new_description(
     source: Path,
-    out: Path | None = None,
+    description_file: Path | None = None,
     name: str | None = None,
-    base: str | None = None,
-    tip: str | None = None,
+    base_link: str | None = None,
+    tip_link: str | None = None,
     tell: Callable[[str], None] = lambda _: None,
     convention: str | None = None,
 ) -> tuple[Path, tuple[str, ...]]:
@@ -262,10 +262,10 @@ def new_description(
 
     Args:
         source: a URDF, an MJCF, or a DH table as CSV or YAML.
-        out: path of the new description; `NAME.yaml` in the present folder when None.
+        description_file: path of the new description; `NAME.yaml` in the present folder when None.
         name: name of the arm; that of the file when None.
-        base: link that the arm stands on; found when None.
-        tip: link that it ends at; before the gripper of the longest branch when None.
+        base_link: link that the arm stands on; found when None.
+        tip_link: link that it ends at; before the gripper of the longest branch when None.
         tell: called with a line at each step.
         convention: convention of a DH table that does not name its own, `standard` or `modified`.
 
@@ -276,21 +276,23 @@ def new_description(
         MotionRefused: no posture or motion is free of collisions, or none can be held.
     """
     read = read_source(source, convention)
-    if read.kind == "dh" and (base or tip):
+    if read.kind == "dh" and (base_link or tip_link):
         raise UsageError(f"{source}: --base and --tip are of URDF and MJCF; a DH table lists the joints that move")
     if read.kind != "dh" and convention is not None:
         raise UsageError(f"{source}: --convention is of DH tables; a URDF or MJCF says where its frames are")
     called = _plain(source.stem if name is None else name)
-    path = Path(f"{called}.yaml") if out is None else out
+    path = Path(f"{called}.yaml") if description_file is None else description_file
     if path.exists() and path.samefile(source):
         path = path.with_name(f"{path.stem}-arm.yaml")
     beside = None if read.kind == "dh" else path.parent / source.name
-    require_place(path.parent)
+    require_writable_place(path.parent)
     if path.exists():
         raise UsageError(f"{path}: {'is a folder' if path.is_dir() else 'exists already'}; give another file by --out")
     if beside is not None and beside.exists() and beside.read_bytes() != source.read_bytes():
         raise UsageError(f"{beside}: exists already, and differs from {source}; give --out a file in another folder")
-    part: dict[str, Any] = {read.kind: source.name, **arm_part(read.outline, source.name, base, tip)} if beside else {}
+    part: dict[str, Any] = (
+        {read.kind: source.name, **arm_part(read.outline, source.name, base_link, tip_link)} if beside else {}
+    )
     if read.table is not None:
         part = {"dh": read.table.model_dump(mode="json")}
     draft = Draft(called, source.name, part)
@@ -300,7 +302,7 @@ def new_description(
             shutil.copyfile(source, trial.with_name(source.name))
 
         def loaded() -> ArmModel:
-            trial.write_text(in_yaml(draft), encoding="utf-8")
+            trial.write_text(description_yaml(draft), encoding="utf-8")
             return arm_model(load_arm(trial), require_masses=False)  # what is none is guessed
 
         draft.remarks += _part_remark(loaded(), draft)
@@ -321,7 +323,7 @@ def new_description(
         write_atomically(beside, read.text)
     if not (schema := path.parent / SCHEMA).exists():
         write_atomically(schema, arm_schema_file().read_text(encoding="utf-8"))
-    write_atomically(path, in_yaml(draft, dict(zip(model.chain.names, model.chain.revolute, strict=True))))
+    write_atomically(path, description_yaml(draft, dict(zip(model.chain.names, model.chain.revolute, strict=True))))
     return path, tuple(draft.remarks)
 
 
@@ -403,7 +405,7 @@ def _joints(draft: Draft, model: ArmModel, file_limits: Mapping[str, FileLimits]
         draft.remarks.append(f"bodies of {', '.join(likely.guessed)}: rods; {why}")
     model = replace(model, prior=likely.delta)
     masses = [float(likely.delta[model.layout.inertial(link)][-1]) for link in range(chain.joints)]
-    draft.total_mass = short(2.0 * sum(masses), 3)
+    draft.total_mass = round_significant(2.0 * sum(masses), 3)
     urdf = model.config.kinematics.urdf
     if urdf is not None and (
         angles_barely_rounded(_joint_angles(urdf)) or remarks_on_angles(base_parameters(chain, model.layout))
@@ -465,14 +467,14 @@ def _joints(draft: Draft, model: ArmModel, file_limits: Mapping[str, FileLimits]
             # The file's exact values: a rounded limit may be wider than the arm's.
             "position": list(ranges[k]),
             "velocity": float(velocity[k]),
-            "acceleration": short(acceleration),
-            "jerk": short(jerk),
-            "torque": float(torque) if effort else short(torque),
+            "acceleration": round_significant(acceleration),
+            "jerk": round_significant(jerk),
+            "torque": float(torque) if effort else round_significant(torque),
             "following_error": _FOLLOWS[turns],
             "home": min(max(0.0, ranges[k][0]), ranges[k][1]),
             "kp": _GAINS[0][0],
             "kd": _GAINS[0][1],
-            "drive_inertia": short(drive, 3),
+            "drive_inertia": round_significant(drive, 3),
         }
         none = {"torque": "guessed: the file's is of no drive"} if placeholder else {}
         draft.origins[name] = {
@@ -606,7 +608,7 @@ def _home(draft: Draft, loaded: Callable[[], ArmModel]) -> ArmModel:
             " the drive has, and is the file in metres and kilograms?"
         )
     for name, value in zip(draft.joints, postures[place], strict=True):
-        draft.joints[name]["home"] = short(float(value), 3)
+        draft.joints[name]["home"] = round_significant(float(value), 3)
     return loaded()
 
 
@@ -652,7 +654,7 @@ def _gains(draft: Draft, loaded: Callable[[], ArmModel]) -> None:
             kp, kd, draft.cutoff[k] = fitting[k][0]
             joint.update(kp=kp, kd=kd)
             finest = max(float(allowed(*fitting[k][0])[k]), _FINEST_ENCODER)
-            draft.encoder[k] = min(ENCODER, short(finest, 2))
+            draft.encoder[k] = min(ENCODER, round_significant(finest, 2))
         model = loaded()
         report = stability(model, motion_limits(model.config), delay_of(model.config))
         if report.stable:
@@ -670,7 +672,7 @@ def _gains(draft: Draft, loaded: Callable[[], ArmModel]) -> None:
     for k, (name, joint) in enumerate(draft.joints.items()):
         unit = "N m/rad" if model.chain.revolute[k] else "N/m"
         draft.origins[name] |= {
-            "kp": f"chosen: stable; {short(joint['kp'] * home[k], 3):g} {unit} with the inertia at home",
+            "kp": f"chosen: stable; {round_significant(joint['kp'] * home[k], 3):g} {unit} with the inertia at home",
             "kd": "chosen: critically damped",
         }
     if finer := [name for name, one in zip(draft.joints, draft.encoder, strict=True) if one < ENCODER]:
@@ -698,7 +700,7 @@ def _motions(draft: Draft, loaded: Callable[[], ArmModel]) -> None:
             return
     moves, draft.frequency, draft.use, draft.seeds = max(found)
     # Half of the time each joint is faster than the median of its speeds.
-    draft.standstill = short(0.5 * float(np.median(_joint_speeds(loaded()), axis=1).min()), 2)
+    draft.standstill = round_significant(0.5 * float(np.median(_joint_speeds(loaded()), axis=1).min()), 2)
     draft.remarks.append(
         f"identification.reversal.speed: {draft.standstill:g} rad/s or m/s; a joint with a small range is never fast"
     )
@@ -739,4 +741,8 @@ def _clear_motions(draft: Draft, loaded: Callable[[], ArmModel]) -> None:
 
 
 def _named(model: ArmModel, delta: Array) -> dict[str, float]:
-    return {name: short(value, 7) for name, value in zip(model.layout.names, delta.tolist(), strict=True) if value}
+    return {
+        name: round_significant(value, 7)
+        for name, value in zip(model.layout.names, delta.tolist(), strict=True)
+        if value
+    }

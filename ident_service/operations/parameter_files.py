@@ -39,8 +39,8 @@ from ident_service.results.manifest import (
     atomic_folder,
     replacing_folder,
     require_folder_of,
-    require_place,
     require_replaceable,
+    require_writable_place,
     write_atomically,
 )
 from ident_service.results.parameter_file import ParameterFile, read_parameters, write_parameters
@@ -81,14 +81,17 @@ class CorrectedFile:
 
 
 def check_file(
-    path: Path, kind: FeasibleSetName | None = None, arm: str | None = None, notation: Notation | None = None
+    parameter_file: Path,
+    set_name: FeasibleSetName | None = None,
+    description: str | None = None,
+    notation: Notation | None = None,
 ) -> CheckedFile:
     """Test if the base values of a parameter file are those of some point of a feasible set (BPFT, eq. 51).
 
     Args:
-        path: the file.
-        kind: feasible set; the file's own when None, or else `pseudo_inertia`.
-        arm: a description whose physical constraints are added; without one, drive inertia, viscous and Coulomb
+        parameter_file: the file.
+        set_name: feasible set; the file's own when None, or else `pseudo_inertia`.
+        description: a description whose physical constraints are added; without one, drive inertia, viscous and Coulomb
             friction are positive.
         notation: notation of the file's names, where it is not ours.
 
@@ -96,40 +99,40 @@ def check_file(
         UsageError, ConfigError, ParameterError: the file or the arm cannot be used.
         SolverError: the solver stopped without an optimum.
     """
-    file, conditions, notes, _ = _read(path, kind, arm, notation)
+    file, conditions, notes, _ = _read(parameter_file, set_name, description, notation)
     certified = file.content.get("feasibility", {}).get("certificate", {}).get("kind") in ("witness", "dual")
     return CheckedFile(conditions.kind, feasibility_test(file.values, file.base, conditions), notes, certified)
 
 
 def correct_file(
-    path: Path,
-    out: Path,
-    kind: FeasibleSetName | None = None,
-    arm: str | None = None,
+    parameter_file: Path,
+    corrected_file: Path,
+    set_name: FeasibleSetName | None = None,
+    description: str | None = None,
     metric: Literal["euclidean", "covariance"] = "euclidean",
     notation: Notation | None = None,
 ) -> CorrectedFile:
-    """Write the feasible parameters nearest to a file's (BPFC, eq. 55) to another file; other content is copied.
+    """Write the feasible parameters nearest to a file's (BPFC, eq. 55) to `corrected_file`; other content is copied.
 
     What no longer holds for the new values is left out: covariances, verdicts, fit and validation.
 
     Args:
-        path: the file.
-        out: path of the corrected file.
-        kind: feasible set; the file's own when None, or else `pseudo_inertia`.
-        arm: a description whose physical constraints are added, as for `check_file`.
+        parameter_file: the file.
+        corrected_file: path of the corrected file.
+        set_name: feasible set; the file's own when None, or else `pseudo_inertia`.
+        description: a description whose physical constraints are added, as for `check_file`.
         metric: metric of the distance: the paper's, in the units of the parameters, or that of the file's covariance,
             which does not depend on the choice of base columns.
         notation: notation of the file's names, where it is not ours; the corrected file has ours.
 
     Raises:
-        UsageError, ConfigError, ParameterError: the file or the arm cannot be used, or `out` not written.
+        UsageError, ConfigError, ParameterError: the file or the arm cannot be used, or `corrected_file` not written.
         SolverError: the solver stopped without an optimum.
     """
-    require_folder_of(out)
-    file, conditions, notes, layout = _read(path, kind, arm, notation)
+    require_folder_of(corrected_file)
+    file, conditions, notes, layout = _read(parameter_file, set_name, description, notation)
     result = feasibility_correction(
-        file.values, file.base, conditions, _covariance(path, file) if metric == "covariance" else None
+        file.values, file.base, conditions, _covariance(parameter_file, file) if metric == "covariance" else None
     ).centred(file.base, conditions)
     content = deepcopy(file.content)
     for stale in _OF_THE_FIT:
@@ -152,7 +155,7 @@ def correct_file(
         "margin": result.margin,
         "certificate": proof.document,
     }
-    write_parameters(out, content)
+    write_parameters(corrected_file, content)
     return CorrectedFile(conditions.kind, result, notes)
 
 
@@ -200,30 +203,30 @@ DOCUMENT, TEXT, PAGE = "comparison.json", "comparison.txt", "comparison.html"
 KEPT = (DOCUMENT, TEXT, PAGE)
 
 
-def compare_files(paths: Sequence[Path], out: Path | None = None) -> tuple[Comparison, tuple[Path, ...]]:
-    """Compare results with the first of them, into a folder or `.json` if given; return (comparison, files written).
+def compare_files(results: Sequence[Path], written_to: Path | None = None) -> tuple[Comparison, tuple[Path, ...]]:
+    """Compare results with the first; write that to a folder or `.json` if given; return (comparison, files written).
 
     Args:
-        paths: two or more.
-        out: a file that ends in `.json`, or a folder for everything; nothing is written when None.
+        results: parameter files or folders of results, two or more.
+        written_to: a file that ends in `.json`, or a folder for everything; nothing is written when None.
 
     Raises:
-        UsageError: fewer than two, one that is not there, or `out` cannot be written.
+        UsageError: fewer than two, one that is not there, or `written_to` cannot be written.
         ParameterError: one is torn, changed or foreign, or they have nothing in common.
         ConfigError: an arm in a folder is not one that this version reads.
     """
-    one_file = out is not None and out.suffix == ".json" and not out.is_dir()
-    if out is not None and one_file:
-        require_folder_of(out)
-    comparison = compare([read_side(path) for path in paths])
-    if out is None:
+    one_file = written_to is not None and written_to.suffix == ".json" and not written_to.is_dir()
+    if written_to is not None and one_file:
+        require_folder_of(written_to)
+    comparison = compare([read_side(path) for path in results])
+    if written_to is None:
         return comparison, ()
     if one_file:
-        write_comparison(out, comparison)
-        return comparison, (out,)
-    with atomic_folder(out) as staging:
+        write_comparison(written_to, comparison)
+        return comparison, (written_to,)
+    with atomic_folder(written_to) as staging:
         names = write_comparison_files(staging, comparison)
-    return comparison, tuple(out / name for name in names)
+    return comparison, tuple(written_to / name for name in names)
 
 
 def compare_into(reference: Path, folder: Path) -> Comparison:
@@ -276,13 +279,15 @@ class PayloadResult:
     files: tuple[str, ...]
 
 
-def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_offsets: bool = False) -> PayloadResult:
-    """Identify the payload that an identified arm carries; write the results, in place of earlier ones in `out`.
+def payload_files(
+    arm_results: Path, recordings: Sequence[Path], payload_results: Path, *, refit_offsets: bool = False
+) -> PayloadResult:
+    """Identify the payload that an identified arm carries; write its results, in place of earlier ones there.
 
     Args:
-        run: folder of results of the arm.
+        arm_results: folder of results of the arm.
         recordings: recordings with the load; a path may end in `@START:END`, the seconds to read.
-        out: folder of the results; an earlier result there is replaced as a whole.
+        payload_results: folder of the results; an earlier result there is replaced as a whole.
         refit_offsets: whether torque offsets may differ from those of the arm.
 
     Raises:
@@ -290,13 +295,13 @@ def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_off
         RecordingError: a recording cannot be used, or ended in a fault.
         SolverError: the solver stopped without an optimum.
     """
-    require_place(out)
-    if not run.is_dir():
-        raise UsageError(f"{run}: not a folder; give the folder of results of the arm without the load")
-    if out.exists() and out.samefile(run):
-        raise UsageError(f"{out}: would replace the arm's parameters; give another folder")
-    require_replaceable(out)
-    side = read_side(run)
+    require_writable_place(payload_results)
+    if not arm_results.is_dir():
+        raise UsageError(f"{arm_results}: not a folder; give the folder of results of the arm without the load")
+    if payload_results.exists() and payload_results.samefile(arm_results):
+        raise UsageError(f"{payload_results}: would replace the arm's parameters; give another folder")
+    require_replaceable(payload_results)
+    side = read_side(arm_results)
     arm = known_arm(side)
     known = side.content.get("torque")  # the torque difference is the load's only if both torques are of the same kind
     opened = open_together(
@@ -311,7 +316,7 @@ def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_off
     sources = [{"name": one.path.name, "sha256": one.sha256} for one in opened]
     document = payload_document(payload, arm, side.sha256, sources)
     text, comparison = payload_text(payload, arm), None
-    with replacing_folder(out) as staging:
+    with replacing_folder(payload_results) as staging:
         write_payload(staging / PAYLOAD_DOCUMENT, document)
         write_atomically(staging / PAYLOAD_TEXT, text)
         names = [PAYLOAD_DOCUMENT, PAYLOAD_TEXT]
@@ -324,7 +329,7 @@ def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_off
             if delta is not None:
                 write_urdf(staging / URDF, arm.model, delta)
                 names.append(URDF)
-            comparison = _compared(side, staging, out)
+            comparison = _compared(side, staging, payload_results)
             names += write_comparison_files(staging, comparison)
         write_manifest(staging)
     return PayloadResult(arm, payload, document, text, comparison, (*names, MANIFEST))

@@ -36,13 +36,13 @@ _STOPPING = 40  # level of events for a fault that stopped the arm (`motion/faul
 _OF_ALL = ("gap", "stamps", "rate")
 
 
-def file_and_range(path: Path) -> tuple[Path, tuple[float, float] | None]:
+def file_and_range(file_with_range: Path) -> tuple[Path, tuple[float, float] | None]:
     """Split `FILE@START:END` into (file, (start, end) [s]); None as range without one, or if the whole path exists.
 
     Raises:
         UsageError: the range ends before it begins.
     """
-    named, seconds = (str(path), None) if path.exists() else split_range(str(path))
+    named, seconds = (str(file_with_range), None) if file_with_range.exists() else split_range(str(file_with_range))
     return Path(named), seconds
 
 
@@ -67,9 +67,9 @@ class OpenedRecordings:
 
 
 def open_together(
-    paths: Sequence[Path],
+    recording_files: Sequence[Path],
     model: ArmModel,
-    forms: Mapping[Path, RecordingFormat] = MappingProxyType({}),
+    formats: Mapping[Path, RecordingFormat] = MappingProxyType({}),
     torque: Torque | None = None,
     payloads: Mapping[Path, Payload] = MappingProxyType({}),
 ) -> OpenedRecordings:
@@ -79,9 +79,9 @@ def open_together(
     own delay. So measured ones are used where all recordings have them, and commanded ones otherwise.
 
     Args:
-        paths: paths of the recordings, as for `open_for_arm`.
+        recording_files: paths of the recordings, as for `open_for_arm`.
         model: the arm, whose `identification.torque` may demand one of them.
-        forms: how each file is laid out, where not as the description says.
+        formats: how each file is laid out, where not as the description says.
         torque: kind of torque that must be used, in place of the description's.
         payloads: known load of each recording that has one, beside that of the description.
 
@@ -89,7 +89,7 @@ def open_together(
         UsageError, RecordingError: as `open_for_arm`; a recording lacks the torque that is demanded.
     """
     asked = torque or model.config.identification.torque
-    found = [open_for_arm(path, model, forms.get(path), asked, payloads.get(path)) for path in paths]
+    found = [open_for_arm(path, model, formats.get(path), asked, payloads.get(path)) for path in recording_files]
     kinds = [torque_in(recording) for recording in found]
     remarks = tuple(
         f"{recording.path}: left out from {recording.ended:.6g} s after its first sample on: the motion was stopped,"
@@ -98,7 +98,7 @@ def open_together(
         if isinstance(recording, RangeRecording) and recording.ended is not None
     )
     if {"measured", "commanded"} <= set(kinds):
-        without = ", ".join(path.name for path, kind in zip(paths, kinds, strict=True) if kind == "commanded")
+        without = ", ".join(path.name for path, kind in zip(recording_files, kinds, strict=True) if kind == "commanded")
         remarks = (
             *remarks,
             f"identified from commanded torques: drives measured none in {without}, and the two are not mixed; leave "
@@ -107,7 +107,11 @@ def open_together(
         for place, kind in enumerate(kinds):
             if kind == "measured":
                 found[place] = open_for_arm(
-                    paths[place], model, forms.get(paths[place]), "commanded", payloads.get(paths[place])
+                    recording_files[place],
+                    model,
+                    formats.get(recording_files[place]),
+                    "commanded",
+                    payloads.get(recording_files[place]),
                 )
         kinds = ["commanded" if kind == "measured" else kind for kind in kinds]
     return OpenedRecordings(tuple(found), " and ".join(dict.fromkeys(kinds)), remarks)
@@ -123,19 +127,19 @@ def torque_in(recording: Recording) -> str:
 
 
 def open_for_arm(
-    path: Path,
+    recording_file: Path,
     model: ArmModel,
-    form: RecordingFormat | None = None,
+    recording_format: RecordingFormat | None = None,
     torque: Torque | None = None,
     payload: Payload | None = None,
 ) -> Recording:
     """Open a recording, or a range of one, for an arm; leave out what follows a stop, and standstill and ends if asked.
 
     Args:
-        path: the file, or `FILE@START:END`.
+        recording_file: the file, or `FILE@START:END`.
         model: the arm.
-        form: how this file is laid out, and what to trim; as the arm's description says when None. Its `trim` counts
-            where it is not the description's, which whatever reads the recording leaves out.
+        recording_format: how this file is laid out, and what to trim; as the arm's description says when None. Its
+            `trim` counts where it is not the description's, which whatever reads the recording leaves out.
         torque: kind of torque to read, in place of the description's.
         payload: known load that the arm carried, beside that of the description.
 
@@ -143,11 +147,11 @@ def open_for_arm(
         UsageError: no such file, or no such range.
         RecordingError: it does not fit the arm, or nothing moves where standstill is to be left out.
     """
-    file, seconds = file_and_range(path)
-    form, gears = form or model.config.recording, model.config.transmission
+    file, seconds = file_and_range(recording_file)
+    recording_format, gears = recording_format or model.config.recording, model.config.transmission
     # Cached, because quality, friction, equations and evidence each read the recording.
     torque = torque or model.config.identification.torque
-    whole = open_recording(file, model.chain.names, fmt=form, transmission=gears, torque=torque)
+    whole = open_recording(file, model.chain.names, fmt=recording_format, transmission=gears, torque=torque)
     cached = CachedRecording(whole)
     cached.payload = payload
     recording: Recording = cached
@@ -156,13 +160,13 @@ def open_for_arm(
         recording = RangeRecording(recording, 0.0, ended)
         recording.ended = ended
     if seconds is not None:
-        recording = RangeRecording(recording, *seconds, label=path.name.removeprefix(file.name))
-    if form.standstill == "cut":
+        recording = RangeRecording(recording, *seconds, label=recording_file.name.removeprefix(file.name))
+    if recording_format.standstill == "cut":
         # Rows near the ends are not used anyway, for want of neighbours; standstill may remain there.
         edge = model.config.identification.edge
         recording = without_standstill(recording, EDGE / USUAL if edge == "choose" else edge)
-    if form.trim != model.config.recording.trim:
-        recording = without_ends(recording, form.trim)
+    if recording_format.trim != model.config.recording.trim:
+        recording = without_ends(recording, recording_format.trim)
     return recording
 
 
@@ -251,17 +255,17 @@ def removed_standstill(recording: Recording) -> tuple[float, float]:
     return recording.standstill if isinstance(recording, RangeRecording) else (0.0, 0.0)
 
 
-def require_no_fault(path: Path, recording: Recording) -> None:
+def require_no_fault(recording_file: Path, recording: Recording) -> None:
     """Raise RecordingError if ident recorded it and a fault stopped the arm within the range that is read.
 
     Args:
-        path: path of the recording as it was named.
+        recording_file: path of the recording as it was named.
         recording: the opened recording.
 
     Raises:
         RecordingError: names the fault and when it was.
     """
-    file, seconds_asked = file_and_range(path)
+    file, seconds_asked = file_and_range(recording_file)
     with file.open("rb") as stream:
         if stream.read(len(MAGIC)) != MAGIC:
             return

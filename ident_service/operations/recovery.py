@@ -29,7 +29,7 @@ from ident_service.motion.control_loop import REST_SPEED
 from ident_service.motion.fault_store import StoredFault
 from ident_service.motion.last_position import PositionFile
 from ident_service.motion.read_only_monitor import Watched, watch
-from ident_service.operations.moving_arms import held_arm
+from ident_service.operations.moving_arms import is_held
 from ident_service.recordings.files import require_writable
 from ident_service.registry.state_folder import control_path, fault_file, ticket_path
 
@@ -72,31 +72,31 @@ class Recovery:
     usable: bool
 
 
-def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str | None = None) -> Recovery:
+def recover(config: ArmConfig, state: Path, arm: Arm | None = None, name_in_commands: str | None = None) -> Recovery:
     """Watch an arm that no process has, reset tripped drives if all faults are acknowledged; return what to do next.
 
     Args:
         config: of the arm.
         state: the state folder.
         arm: the arm, not open; the configured one when None.
-        called: the arm as commands are to name it, its file for example; its name when None.
+        name_in_commands: the arm as commands are to name it, its file for example; its name when None.
 
     Raises:
         UsageError: the file of faults is damaged.
         MotionRefused: the description has no position limits.
         DriverError: nothing is installed that can reach such an arm.
     """
-    limits, called = motion_limits(config), called or config.name
+    limits, name_in_commands = motion_limits(config), name_in_commands or config.name
     faults = fault_file(state, config.name).remembered()
     pid = controlling_pid(control_path(state, config.name))
     if pid is not None:
         first: tuple[str, ...] = (
-            f"`ident stop {called}` stops it; process {pid} moves it, or holds it after a stop.",
-            f"`ident supported {called}`, if it is held: once it is supported, or at home.",
+            f"`ident stop {name_in_commands}` stops it; process {pid} moves it, or holds it after a stop.",
+            f"`ident supported {name_in_commands}`, if it is held: once it is supported, or at home.",
         )
-        if held_arm(state, config.name):
-            first = (f"Support the arm, then `ident supported {called}`: process {pid} holds it until then.",)
-        steps = (*first, f"`ident recover {called}` again, when it is at rest.")
+        if is_held(state, config.name):
+            first = (f"Support the arm, then `ident supported {name_in_commands}`: process {pid} holds it until then.",)
+        steps = (*first, f"`ident recover {name_in_commands}` again, when it is at rest.")
         return Recovery(config.name, faults, pid, None, "", "", (), {}, (), steps, False)
     arm = make_arm(config) if arm is None else arm
     seen, unreachable, zero_lost = None, "", ""
@@ -116,11 +116,11 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str 
     out = [] if seen is None else position_limit_violations(seen.position, limits, seen.joint_names)
     support, holds = _support(config), False
     if seen is not None and config.idle_drives_hold and any(w & AxisStatus.IDLE for w in seen.status):
-        support, holds = _HELD.format(called), True
-    before = _before(called, faults, seen, unreachable, zero_lost, tripped, refusal, limits)
+        support, holds = _HELD.format(name_in_commands), True
+    before = _before(name_in_commands, faults, seen, unreachable, zero_lost, tripped, refusal, limits)
     before = [support, *before] if before or holds else before
     usable = not before
-    steps = (*before, _last_step(called, seen, limits, bool(out)))
+    steps = (*before, _last_step(name_in_commands, seen, limits, bool(out)))
     return Recovery(config.name, faults, None, seen, unreachable, zero_lost, reset, tripped, tuple(out), steps, usable)
 
 

@@ -93,17 +93,17 @@ class PrunableRecording:
     bytes: int
 
 
-def prunable_recordings(db: Database, state: Path, newest: int) -> list[PrunableRecording]:
+def prunable_recordings(db: Database, state: Path, runs_to_keep: int) -> list[PrunableRecording]:
     """Return the recordings that `prune` would delete: of older runs, needed by no acceptance and no job.
 
     Kept are those of accepted runs, those of other runs that an accepted set was identified from or judged on, those of
-    each arm's `newest` runs, and those that a waiting or running job makes or reads.
+    each arm's `runs_to_keep` runs, and those that a waiting or running job makes or reads.
 
     Raises:
         UsageError: a number below 0.
         ParameterError: an accepted set was changed, so that nobody knows what it stems from.
     """
-    if newest < 0:
+    if runs_to_keep < 0:
         raise UsageError("the number of newest runs that keep their recordings is 0 or more")
     synchronise(db, state)
     kept = accepted_runs(db)
@@ -118,7 +118,7 @@ def prunable_recordings(db: Database, state: Path, newest: int) -> list[Prunable
     return [
         PrunableRecording(row["run"], row["name"], row["bytes"])
         for row in rows
-        if row["rank"] > newest and row["run"] not in kept | busy and row["sha256"] not in needed
+        if row["rank"] > runs_to_keep and row["run"] not in kept | busy and row["sha256"] not in needed
     ]
 
 
@@ -135,9 +135,9 @@ def _busy(db: Database) -> set[str]:
     return found
 
 
-def prune(db: Database, state: Path, newest: int, who: str) -> list[PrunableRecording]:
+def prune(db: Database, state: Path, runs_to_keep: int, who: str) -> list[PrunableRecording]:
     """Delete the recordings that `prunable_recordings` returns, and return them; a kill on the way does no damage."""
-    gone = prunable_recordings(db, state, newest)
+    gone = prunable_recordings(db, state, runs_to_keep)
     for one in gone:
         with db.transaction():
             db.write("UPDATE recordings SET deleted = ? WHERE run = ? AND name = ?", time.time(), one.run, one.name)

@@ -76,15 +76,15 @@ class _Shown:
     trace: PredictionTrace | None
 
 
-def view_run(
-    folder: Path, recordings: Sequence[Path] = (), save: Path | None = None, urdf: Path | None = None
+def show_run_in_viewer(
+    folder: Path, recordings: Sequence[Path] = (), save_file: Path | None = None, urdf: Path | None = None
 ) -> Viewed:
     """Show a run in Rerun's viewer, or write what it would show into a file.
 
     Args:
         folder: folder made by `ident run`, `simulate` or `identify`.
         recordings: recordings besides those in the folder; results of `identify` have none of their own.
-        save: file that must not exist; None opens the viewer.
+        save_file: file that must not exist; None opens the viewer.
         urdf: URDF with meshes to draw instead of capsules.
 
     Raises:
@@ -93,20 +93,20 @@ def view_run(
         IdentError: results, recordings or meshes that cannot be read.
     """
     rr = _rerun()
-    if save is None and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    if save_file is None and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise UsageError(
             "there is no display for Rerun's viewer; write a file with --save FILE.rrd, and open it elsewhere"
         )
-    if save is not None and save.exists():
-        raise UsageError(f"{save}: exists already; give a file that does not")
-    if save is not None:
-        require_folder_of(save)
+    if save_file is not None and save_file.exists():
+        raise UsageError(f"{save_file}: exists already; give a file that does not")
+    if save_file is not None:
+        require_folder_of(save_file)
     config = _config(folder)
     model = arm_model(config)
     shown = list(_recordings(folder, recordings, model))
     meshes = [] if urdf is None else visual_meshes(urdf, config.kinematics, model.chain)
     stream = rr.RecordingStream("ident", recording_id=f"{config.name} {folder.resolve().name}")
-    partial = None if save is None else save.with_name(save.name + ".partial")
+    partial = None if save_file is None else save_file.with_name(save_file.name + ".partial")
     try:
         if partial is None:
             stream.spawn(default_blueprint=_layout(model, shown))
@@ -116,13 +116,15 @@ def view_run(
             _send(stream, one, model, meshes)
         stream.flush()
         stream.disconnect()
-        if partial is not None and save is not None:
-            partial.replace(save)
+        if partial is not None and save_file is not None:
+            partial.replace(save_file)
     except BaseException:
         if partial is not None:
             partial.unlink(missing_ok=True)
         raise
-    return Viewed(tuple(one.name for one in shown), tuple(one.name for one in shown if one.trace is not None), save)
+    return Viewed(
+        tuple(one.name for one in shown), tuple(one.name for one in shown if one.trace is not None), save_file
+    )
 
 
 def _rerun() -> Any:

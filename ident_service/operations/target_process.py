@@ -37,19 +37,19 @@ def main() -> int:
     return 0
 
 
-def watch(folder: Path, target: Target, least: float) -> dict[str, Any] | None:
+def watch(folder: Path, target: Target, least_seconds: float) -> dict[str, Any] | None:
     """Follow a run's recording until the target is reached; return `seconds` and `share` then, None if it ends before.
 
     Args:
         folder: of the run.
         target: accuracy target.
-        least: time of the motion before which nothing counts [s]: its period, zero where it has none.
+        least_seconds: time of the motion before which nothing counts [s]: its period, zero where it has none.
 
     Raises:
         IdentError: the recording or the description cannot be read.
     """
     model = arm_model(arm_from_json(folder / "arm.json"))
-    growing = SequentialLeastSquares(model, in_blocks=True, period=least)
+    growing = SequentialLeastSquares(model, in_blocks=True, period=least_seconds)
     places = target.places(growing.base, model.config.name)
     if (tail := _opened(folder)) is None:
         return None
@@ -64,7 +64,7 @@ def watch(folder: Path, target: Target, least: float) -> dict[str, Any] | None:
             continue
         seconds = (doubt.until_ns - tail.exciting_ns) * 1e-9
         worst = worst_share(doubt, places)
-        row = row + 1 if seconds >= least and worst <= target.share else 0
+        row = row + 1 if seconds >= least_seconds and worst <= target.share else 0
         if row >= _IN_A_ROW:
             return {"seconds": round(seconds, 3), "share": worst}
 

@@ -18,12 +18,12 @@ _FILE = "parameters.json"
 _CHANGEABLE = frozenset({"identification", "recording", "driver"})
 
 
-def verify_file(path: Path, arm: str | None = None) -> Verification:
+def verify_file(certified_file: Path, description: str | None = None) -> Verification:
     """Check a certificate in exact arithmetic against an arm's conditions, or else the file's own; return the verdict.
 
     Args:
-        path: the file, or a folder of results.
-        arm: description whose conditions those of the file must be: a file, the name of a shipped one, or the
+        certified_file: the file, or a folder of results.
+        description: description whose conditions those of the file must be: a file, the name of a shipped one, or the
             `arm.json` of a folder of results. Without one, the file is held against its own conditions.
 
     Raises:
@@ -31,20 +31,22 @@ def verify_file(path: Path, arm: str | None = None) -> Verification:
         ConfigError: the description has mistakes.
     """
     try:
-        if arm is None:
-            return verify_path(path)
-        stated, custom = _arm(arm, path / _FILE if path.is_dir() else path)
-        result = verify_path(path, stated)
+        if description is None:
+            return verify_path(certified_file)
+        stated, custom = _arm(description, certified_file / _FILE if certified_file.is_dir() else certified_file)
+        result = verify_path(certified_file, stated)
         if custom is None:
             return result
         return replace(result, message=f"{result.message}; {custom_note(custom)}")
     except OSError as error:
-        raise UsageError(f"{error.filename or path}: {error.strerror or error}") from None
+        raise UsageError(f"{error.filename or certified_file}: {error.strerror or error}") from None
 
 
-def custom_note(name: str) -> str:
+def custom_note(arm_name: str) -> str:
     """Return the note that an answer about an arm leaves out its `constraints.custom`."""
-    return f"constraints.custom ({name}) of the description is code that only identify and simulate run; left out here"
+    return (
+        f"constraints.custom ({arm_name}) of the description is code that only identify and simulate run; left out here"
+    )
 
 
 def _arm(arm: str, file: Path) -> tuple[Arm, str | None]:

@@ -44,7 +44,7 @@ def index_run(db: Database, state: Path, run: str) -> Row:
     # A run without a manifest was killed.
     whole = (folder / MANIFEST).is_file()
     gone = frozenset(row["name"] for row in db.rows("SELECT name FROM recordings WHERE run = ? AND deleted > 0", run))
-    files = dict(verified_files(folder, but=gone)) if whole else {}
+    files = dict(verified_files(folder, may_be_gone=gone)) if whole else {}
     arm = _document(folder / _ARM)
     ended = _document(folder / ENDED) if (folder / ENDED).is_file() else None
     own = str(_document(folder / UPLOAD).get("name")) if UPLOAD in files else ""

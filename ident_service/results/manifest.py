@@ -28,7 +28,7 @@ from ident_service.recordings.files import (
 _EXCHANGE = 2  # RENAME_EXCHANGE
 
 
-def require_place(folder: Path) -> None:
+def require_writable_place(folder: Path) -> None:
     """Raise UsageError if a folder is a file or could not be written, before work is done for it; makes nothing.
 
     Raises:
@@ -79,7 +79,7 @@ def staging_beside(folder: Path) -> Iterator[Path]:
     Raises:
         UsageError: the folder's place cannot be written, or is a file.
     """
-    require_place(folder)
+    require_writable_place(folder)
     place = folder.resolve()  # a link to a folder stays one, and "." has a name
     staging = place.with_name(f".{place.name}.{secrets.token_hex(4)}.partial")
     try:
@@ -94,26 +94,27 @@ def staging_beside(folder: Path) -> Iterator[Path]:
         raise
 
 
-def exchange_folders(one: Path, other: Path) -> None:
+def exchange_folders(first: Path, second: Path) -> None:
     """Exchange the names of two folders of one file system, at once where the kernel can (renameat2, Linux 3.15).
 
-    Elsewhere a kill may come between two renames; nothing is lost then, but `other` stands under a hidden name.
+    Elsewhere a kill may come between two renames; nothing is lost then, but `second` stands under a hidden name.
 
     Raises:
         OSError: they cannot be renamed; nothing is changed.
     """
     renameat2 = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-    names = [os.fsencode(path.absolute()) for path in (one, other)]  # absolute: what they are relative to is not used
+    # Absolute: what they are relative to is not used.
+    names = [os.fsencode(path.absolute()) for path in (first, second)]
     if renameat2 is not None and renameat2(0, names[0], 0, names[1], _EXCHANGE) == 0:
         return
-    between = other.with_name(f".{other.name}.{secrets.token_hex(4)}.old")
-    other.rename(between)
+    between = second.with_name(f".{second.name}.{secrets.token_hex(4)}.old")
+    second.rename(between)
     try:
-        one.rename(other)
+        first.rename(second)
     except OSError:
-        between.rename(other)
+        between.rename(second)
         raise
-    between.rename(one)
+    between.rename(first)
 
 
 MANIFEST: Final = "manifest.json"
@@ -154,12 +155,12 @@ def named_files(folder: Path) -> Mapping[str, str]:
     return files
 
 
-def verified_files(folder: Path, *, but: frozenset[str] = frozenset()) -> Mapping[str, str]:
-    """Return name to SHA-256 of a manifest's files; raise unless each is there with that hash, or gone and in `but`.
+def verified_files(folder: Path, *, may_be_gone: frozenset[str] = frozenset()) -> Mapping[str, str]:
+    """Return name to SHA-256 of a manifest's files; raise unless each has that hash, or is in `may_be_gone` and gone.
 
     Args:
         folder: folder to be read.
-        but: names that may be gone, because a retention policy let them go.
+        may_be_gone: names that may be gone, because a retention policy let them go.
 
     Raises:
         UsageError, ParameterError: as `named_files`; or a file is missing, a link, or not what the manifest names.
@@ -170,7 +171,7 @@ def verified_files(folder: Path, *, but: frozenset[str] = frozenset()) -> Mappin
         if path.is_symlink():
             raise ParameterError(f"{path}: a link; a folder of results holds its own files")
         if not path.is_file():
-            if name in but and not path.exists():
+            if name in may_be_gone and not path.exists():
                 continue
             raise ParameterError(f"{path}: named by the manifest, but not there; {_REMEDY}")
         if file_sha256(path) != wanted:
@@ -213,7 +214,7 @@ def require_replaceable(folder: Path) -> None:
         UsageError: it is a file, lies where nothing can be written, or holds what is no earlier result; with what it
             is, and the remedy.
     """
-    require_place(folder)
+    require_writable_place(folder)
     if not folder.exists():
         return
     if not (others := _others(folder)):

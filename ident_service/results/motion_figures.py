@@ -13,7 +13,16 @@ from itertools import pairwise
 import numpy as np
 
 from ident_service.errors import UsageError
-from ident_service.results.plots import LARGEST, Array, Axes, Canvas, number, require_drawable, round_values, visible
+from ident_service.results.plots import (
+    LARGEST,
+    Array,
+    Axes,
+    Canvas,
+    format_number,
+    require_drawable,
+    round_values,
+    visible_samples,
+)
 
 QUANTITIES = ("position", "velocity", "acceleration", "torque")
 _UNITS = {
@@ -151,10 +160,11 @@ def joints_over_time(traces: MotionTraces, title: str = "Motion of the joints") 
             _panel(canvas, traces, quantity, row, at, _TOP + step * row)
         axes = Axes(at, rows_end, _PANEL, 1.0, traces.time[0], traces.time[-1], 0.0, 1.0)
         for value in round_values(axes.low_x, axes.high_x, 6):
-            canvas.text("soft", float(axes.x(value)), rows_end + 14, number(value, 6), size=10, anchor="middle")
+            canvas.text("soft", float(axes.x(value)), rows_end + 14, format_number(value, 6), size=10, anchor="middle")
         canvas.text("soft", at + _PANEL / 2, rows_end + 30, "time [s]", anchor="middle")
     length = traces.time[-1] - traces.time[0]
-    about = f"{len(names)} joints ({', '.join(traces.names)}) over {number(length)} s: {', '.join(given)}. {summary}."
+    duration = f"{format_number(length)} s"
+    about = f"{len(names)} joints ({', '.join(traces.names)}) over {duration}: {', '.join(given)}. {summary}."
     return canvas.svg(title, about)
 
 
@@ -171,11 +181,11 @@ def _panel(canvas: Canvas, traces: MotionTraces, quantity: str, joint: int, left
         canvas.line("grid", float(axes.x(value)), top, float(axes.x(value)), top + _HEIGHT)
     ticks = {value: float(axes.y(value)) for value in _ticks(axes, low, high)}
     for value, at in ticks.items():
-        canvas.text("soft", left - 5, at + 3.5, number(value), size=10, anchor="end")
+        canvas.text("soft", left - 5, at + 3.5, format_number(value), size=10, anchor="end")
         if value not in (low, high):
             canvas.line("grid", left, at, left + _PANEL, at)
     canvas.rectangle("frame", left, top, _PANEL, _HEIGHT)
-    shown = visible(traces.time, values, int(_PANEL))
+    shown = visible_samples(traces.time, values, int(_PANEL))
     canvas.polyline("trace", axes.x(traces.time[shown]), axes.y(values[shown]))
     # Over the values: a limit that is crossed must still be seen.
     for limit in (low, high):
@@ -229,7 +239,7 @@ def _percent(share: float) -> str:
     if 0.0 < percent < 0.5:
         return "< 1 %"
     whole = np.ceil(percent) if share > 1.0 else min(np.round(percent), 99.0) if share < 1.0 else 100.0
-    return f"{number(float(whole), 6)} %"
+    return f"{format_number(float(whole), 6)} %"
 
 
 def _legend(canvas: Canvas, right: float, ramps: bool) -> None:

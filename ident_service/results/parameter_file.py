@@ -72,25 +72,27 @@ _MOST = 10  # mistakes that are reported
 _VALUES, _ENTRIES, _KEYS, _CHARACTERS = 20_000, 200, 1000, 1000
 
 
-def require_schema(content: Any, name: str, where: object, what: str) -> None:
+def require_schema(content: Any, schema_name: str, origin: object, expected: str) -> None:
     """Raise ParameterError unless a document fits the schema `NAME.schema.json`.
 
     Args:
         content: JSON values.
-        name: name of the schema: `parameters`, `evidence`, `comparison` or `payload`.
-        where: file that it comes from or goes to.
-        what: description of the document that is expected, for the message.
+        schema_name: name of the schema: `parameters`, `evidence`, `comparison` or `payload`.
+        origin: file that it comes from or goes to.
+        expected: description of the document that is expected, for the message.
 
     Raises:
         ParameterError: it does not fit; the first mistakes with their places.
     """
-    validator = _validator(name)
+    validator = _validator(schema_name)
     if validator.is_valid(content):
         return
     found = validator.iter_errors(_first(content, [_VALUES]))
     mistakes = sorted(((_place(one.instance_path), one.message) for one in found), key=lambda mistake: mistake[0])
     listed = "; ".join(f"{place}: {message[:200]}" for place, message in mistakes[:_MOST])
-    raise ParameterError(f"{where}: not {what}: {listed or f'something is wrong beyond its first {_ENTRIES} entries'}")
+    raise ParameterError(
+        f"{origin}: not {expected}: {listed or f'something is wrong beyond its first {_ENTRIES} entries'}"
+    )
 
 
 def _first(value: Any, room: list[int]) -> Any:
@@ -125,29 +127,29 @@ def information_document(information: Information) -> list[dict[str, Any]]:
     return joints
 
 
-def information_from(joints: list[dict[str, Any]], base: int) -> Information:
+def information_from(entries: list[dict[str, Any]], base_count: int) -> Information:
     """Return the information of a document, the inverse of `information_document`.
 
     Args:
-        joints: JSON value that `information_document` made.
-        base: number of base parameters.
+        entries: JSON value that `information_document` made.
+        base_count: number of base parameters.
 
     Raises:
         ParameterError: triangles of the wrong size, or about parameters that are not there.
     """
     supports, factors = [], []
-    for number, joint in enumerate(joints, 1):
+    for number, joint in enumerate(entries, 1):
         support = np.array(joint["parameters"], dtype=np.intp)
         size = len(support) + 1
         upper = np.triu_indices(size)
-        if len(joint["triangle"]) != len(upper[0]) or np.any(np.diff(support) <= 0) or np.any(support >= base):
-            raise ParameterError(f"information of joint {number} is not about {base} base parameters")
+        if len(joint["triangle"]) != len(upper[0]) or np.any(np.diff(support) <= 0) or np.any(support >= base_count):
+            raise ParameterError(f"information of joint {number} is not about {base_count} base parameters")
         factor = np.zeros((size, size))
         factor[upper] = joint["triangle"]
         supports.append(support)
         factors.append(factor)
-    rows = np.array([joint["rows"] for joint in joints], dtype=np.int64)
-    return Information(tuple(supports), tuple(factors), rows, base)
+    rows = np.array([joint["rows"] for joint in entries], dtype=np.int64)
+    return Information(tuple(supports), tuple(factors), rows, base_count)
 
 
 MAX_BYTES = 4 * 2**20
@@ -179,14 +181,14 @@ class ParameterFile:
 
 
 def read_parameters(
-    path: Path, names: tuple[str, ...] | None = None, notation: Notation | None = None
+    parameter_file: Path, link_parameter_names: tuple[str, ...] | None = None, notation: Notation | None = None
 ) -> ParameterFile:
     """Read a parameter file; check its schema, and that its expressions are independent and name link parameters.
 
     Args:
-        path: the file, or the folder of results that holds it.
-        names: the link parameters of an arm; without them, the ten of every link up to the highest number that the
-            expressions mention, and the joint terms that they mention.
+        parameter_file: the file, or the folder of results that holds it.
+        link_parameter_names: the link parameters of an arm; without them, the ten of every link up to the highest
+            number that the expressions mention, and the joint terms that they mention.
         notation: notation of the file's names, where it is not ours.
 
     Raises:
@@ -194,25 +196,26 @@ def read_parameters(
         ParameterError: not JSON, not of the schema, a name that is no link parameter, or expressions that do not parse
             or depend on each other.
     """
-    if path.is_dir():
-        path = path / "parameters.json"
-    if not path.is_file():
-        raise UsageError(f"no such file: {path}")
-    if path.stat().st_size > MAX_BYTES:
-        raise ParameterError(f"{path}: larger than {MAX_BYTES} bytes")
+    if parameter_file.is_dir():
+        parameter_file = parameter_file / "parameters.json"
+    if not parameter_file.is_file():
+        raise UsageError(f"no such file: {parameter_file}")
+    if parameter_file.stat().st_size > MAX_BYTES:
+        raise ParameterError(f"{parameter_file}: larger than {MAX_BYTES} bytes")
     try:
-        content = strict_json(path.read_text(encoding="utf-8"))
+        content = strict_json(parameter_file.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
-        raise ParameterError(f"{path}: not JSON: {error}") from None
-    _require_document(content, path)
+        raise ParameterError(f"{parameter_file}: not JSON: {error}") from None
+    _require_document(content, parameter_file)
     table = content["base_parameters"]
     expressions, values = tuple(table["expressions"]), np.array(table["values"], dtype=float)
     for key, column in table.items():
         if len(column) != len(expressions):
-            raise ParameterError(f"{path}: {len(expressions)} expressions but {len(column)} {key}")
+            raise ParameterError(f"{parameter_file}: {len(expressions)} expressions but {len(column)} {key}")
     if len(expressions) > MOST_EXPRESSIONS or sum(map(len, expressions)) > MOST_CHARACTERS:
         raise ParameterError(
-            f"{path}: more than {MOST_EXPRESSIONS} expressions, or more than {MOST_CHARACTERS} characters in them"
+            f"{parameter_file}: more than {MOST_EXPRESSIONS} expressions, or more than {MOST_CHARACTERS} characters in "
+            "them"
         )
     notes: tuple[str, ...] = ()
     try:
@@ -224,9 +227,9 @@ def read_parameters(
                 printed = content["link_parameters"]
                 printed["names"] = [translate(name, notation) for name in printed["names"]]
         mentioned = _names_in(expressions, content.get("link_parameters", {}).get("names", ()))
-        base = base_from_expressions(expressions, mentioned if names is None else names)
+        base = base_from_expressions(expressions, mentioned if link_parameter_names is None else link_parameter_names)
     except ParameterError as error:
-        raise ParameterError(f"{path}: {error}") from None
+        raise ParameterError(f"{parameter_file}: {error}") from None
     return ParameterFile(base, values, content.get("feasible_set"), content, notes)
 
 
@@ -449,12 +452,12 @@ AGREEMENT = 1e-9
 _LARGEST = 1e30  # largest value in SI units; far beyond every arm, and its square is still finite
 
 
-def require_consistent(file: ParameterFile, where: Path) -> None:
+def require_consistent(file: ParameterFile, origin: Path) -> None:
     """Raise ParameterError unless the values of a parameter file agree with each other and are of possible size.
 
     Args:
         file: parameter file that was read.
-        where: origin of the file, for errors.
+        origin: origin of the file, for errors.
 
     Raises:
         ParameterError: a number that no parameter has; base values that the link values do not have; or, without
@@ -467,18 +470,18 @@ def require_consistent(file: ParameterFile, where: Path) -> None:
     for key, values in rows.items():
         largest = max((abs(float(value)) for value in values if value is not None), default=0.0)
         if not largest <= _LARGEST:
-            raise ParameterError(f"{where}: {largest:g} among its {key}; no parameter of an arm is that large")
+            raise ParameterError(f"{origin}: {largest:g} among its {key}; no parameter of an arm is that large")
     scale = AGREEMENT * float(np.abs(file.values).max())
     free = table.get("unconstrained_values")
     unheld = free is not None and file.content.get("feasible_set") == "none"
     if unheld and np.abs(np.array(free, dtype=float) - file.values).max() > scale:
         raise ParameterError(
-            f"{where}: was fitted without constraints, but its values are not its unconstrained values; one of them "
+            f"{origin}: was fitted without constraints, but its values are not its unconstrained values; one of them "
             "was changed"
         )
     delta = named_link_values(file)
     if delta is not None and set(file.base.names) <= set(delta):
-        require_base_values(file.base, np.array([delta[name] for name in file.base.names]), file.values, where)
+        require_base_values(file.base, np.array([delta[name] for name in file.base.names]), file.values, origin)
 
 
 def named_link_values(file: ParameterFile) -> dict[str, float] | None:
@@ -489,19 +492,19 @@ def named_link_values(file: ParameterFile) -> dict[str, float] | None:
     return {name: float(value) for name, value in zip(table["names"], table["values"], strict=True)}
 
 
-def require_base_values(base: BaseParameters, delta: Array, values: Array, where: Path) -> None:
+def require_base_values(base: BaseParameters, delta: Array, base_values: Array, origin: Path) -> None:
     """Raise ParameterError unless the link values have the base values.
 
     Args:
         base: the grouping.
         delta: link values in its order, shape (parameters,).
-        values: base values, shape (base,).
-        where: origin of the values, for errors.
+        base_values: base values, shape (base,).
+        origin: origin of the values, for errors.
 
     Raises:
         ParameterError: they do not.
     """
-    if np.abs(base.K @ delta - values).max() > AGREEMENT * np.abs(values).max():
+    if np.abs(base.K @ delta - base_values).max() > AGREEMENT * np.abs(base_values).max():
         raise ParameterError(
-            f"{where}: its link parameters do not have the values of its base parameters; one of them was changed"
+            f"{origin}: its link parameters do not have the values of its base parameters; one of them was changed"
         )

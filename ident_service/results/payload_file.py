@@ -167,7 +167,7 @@ def payload_text(payload: Payload, arm: KnownArm) -> str:
             f"the nearest physical body, p = {payload.body.p:.2g}, at most {payload.body.torque_share[worst]:.2%} of "
             f"the torque of joint {names[worst]} away",
         ]
-        values, words = rounded(payload.body.delta[: len(INERTIAL)]), body_words(payload)
+        values, words = without_rounding_errors(payload.body.delta[: len(INERTIAL)]), body_words(payload)
         body = [f"{name} {value:.4g}" for name, value in zip(payload.base.names, values, strict=False)]
         shown = [text for text, word in zip(body, words, strict=True) if word != "chosen"]
         lines.append("  " + "  ".join(shown))
@@ -178,7 +178,7 @@ def payload_text(payload: Payload, arm: KnownArm) -> str:
     return "\n".join(lines) + "\n"
 
 
-def rounded(values: Array) -> Array:
+def without_rounding_errors(values: Array) -> Array:
     """Return a body's ten parameters, zero for those that are only rounding beside the largest of their quantity."""
     shown = np.array(values, dtype=float)
     for quantity in (slice(0, 6), slice(6, 9), slice(9, 10)):
@@ -201,7 +201,7 @@ def loaded_parameters(
     content: Mapping[str, Any],
     arm: KnownArm,
     payload: Payload,
-    recorded: Equations,
+    payload_equations: Equations,
     recordings: Sequence[Mapping[str, str]],
 ) -> tuple[dict[str, Any], Array | None]:
     """Return (content of `parameters.json` of the arm with its payload, link parameters (layout.size,) or None).
@@ -210,7 +210,7 @@ def loaded_parameters(
         content: content of the arm's parameter file.
         arm: the arm as it was identified.
         payload: payload with a body.
-        recorded: equations of the second recording.
+        payload_equations: equations of the second recording.
         recordings: name and sha256 of each.
 
     Returns:
@@ -235,7 +235,7 @@ def loaded_parameters(
     proof = certify(beta, base, conditions, delta)
     covariance = loaded_covariance(arm, payload)
     deviations = np.sqrt(np.diag(covariance)) * _deviation_factors(content)
-    as_zero = negligible(recorded.everything)
+    as_zero = negligible(payload_equations.everything)
     document = {key: deepcopy(value) for key, value in content.items() if key not in _STALE}
     table = document["base_parameters"]
     for stale in _OF_ARM_ALONE:
@@ -248,18 +248,18 @@ def loaded_parameters(
         "negligible": finite_or_none(as_zero),
         "verdicts": list(verdicts(beta, deviations, as_zero)),
     }
-    condition = ordinary_least_squares(recorded.total).condition_number
+    condition = ordinary_least_squares(payload_equations.total).condition_number
     document |= {
         "arm": {"name": config.name, "joints": list(arm.model.chain.names), "sha256": config.sha256},
         "feasible_set": kind if delta is not None else "none",
         "feasibility": {"feasible": proof.verdict == "feasible", "margin": margin, "certificate": proof.document},
         "fit": {
-            "samples": recorded.samples,
+            "samples": payload_equations.samples,
             "blocks": min(payload.blocks, arm.blocks or payload.blocks),
             "condition_number": condition if np.isfinite(condition) else None,
             **_errors(payload.fitted, arm.model.chain.names),
         },
-        "information": information_document(recorded.total),
+        "information": information_document(payload_equations.total),
         "provenance": {
             "recordings": [dict(one) for one in recordings],
             "software": f"ident-service {__version__}",

@@ -123,12 +123,12 @@ _SHAPES = {
 }
 
 
-def style() -> str:
+def svg_style() -> str:
     """Return the style sheet as an SVG element; readers who prefer dark get the dark colours."""
-    return f"<style>{sheet()}</style>"
+    return f"<style>{css_style_sheet()}</style>"
 
 
-def sheet() -> str:
+def css_style_sheet() -> str:
     """Return the style sheet as CSS, for a page that holds many drawings."""
 
     def rules(rows: Iterable[tuple[str, str]]) -> str:
@@ -148,7 +148,7 @@ Array = NDArray[np.float64]
 LARGEST = 1e12  # beyond any quantity of an arm; pixels could not be computed from much more
 
 
-def plain(text: str) -> str:
+def xml_text(text: str) -> str:
     """Return text as XML content or attribute: quoted, without characters that XML does not have."""
     return html.escape(printable(text))
 
@@ -158,7 +158,7 @@ def printable(text: str) -> str:
     return re.sub("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "\ufffd", text)
 
 
-def number(value: float, digits: int = 3) -> str:
+def format_number(value: float, digits: int = 3) -> str:
     """Format a number for people, with a real minus sign."""
     text = f"{value:.{digits}g}"
     if "e+" in text and abs(value) < 1e6:
@@ -183,7 +183,7 @@ def points_of(x: Array, y: Array) -> str:
 
 
 def _hinted(tag: str, attributes: str, hint: str) -> str:
-    return f"<{tag} {attributes}><title>{plain(hint)}</title></{tag}>" if hint else f"<{tag} {attributes}/>"
+    return f"<{tag} {attributes}><title>{xml_text(hint)}</title></{tag}>" if hint else f"<{tag} {attributes}/>"
 
 
 class Canvas:
@@ -231,11 +231,11 @@ class Canvas:
         upright: bool = False,
     ) -> None:
         """Draw one line of text; `hint` appears where a pointer rests on it, and `upright` text reads upwards."""
-        title = f"<title>{plain(hint)}</title>" if hint else ""
+        title = f"<title>{xml_text(hint)}</title>" if hint else ""
         where = f'x="{_pixel(x)}" y="{_pixel(y)}" font-size="{_pixel(size)}" text-anchor="{anchor}"'
         if upright:
             where += f' transform="rotate(-90 {_pixel(x)} {_pixel(y)})"'
-        self._parts.append(f'<text class="{kind}" {where}>{title}{plain(words)}</text>')
+        self._parts.append(f'<text class="{kind}" {where}>{title}{xml_text(words)}</text>')
 
     def clip(self, axes: Axes | None) -> None:
         """Clip what is drawn from now on to the rectangle of some axes; None ends that."""
@@ -260,9 +260,9 @@ class Canvas:
             f'<svg{space} class="ident-figure" role="img" width="{self._width}" '
             f'height="{self._height}" viewBox="0 0 {self._width} {self._height}" style="max-width:100%;height:auto">'
         )
-        about = f"<title>{plain(title)}</title><desc>{plain(description)}</desc>"
+        about = f"<title>{xml_text(title)}</title><desc>{xml_text(description)}</desc>"
         ground = '<rect class="ground" width="100%" height="100%"/>'
-        sheet = "" if inline else style()
+        sheet = "" if inline else svg_style()
         return "\n".join([head + about + sheet + ground, *self._parts, "</svg>"]) + "\n"
 
 
@@ -288,28 +288,30 @@ class Axes:
         return np.asarray(self.top + self.height * (self.high_y - np.asarray(value)) / (self.high_y - self.low_y))
 
 
-def round_values(low: float, high: float, most: int) -> list[float]:
-    """Return at most `most` + 1 round numbers between two numbers, evenly spaced by 1, 2 or 5 times a power of ten."""
-    step = 10.0 ** np.floor(np.log10((high - low) / most))
-    step = next(step * factor for factor in (1.0, 2.0, 5.0, 10.0) if step * factor * most >= (high - low) * (1 - 1e-9))
+def round_values(low: float, high: float, most_steps: int) -> list[float]:
+    """Return at most `most_steps` + 1 round numbers in a range, spaced by 1, 2 or 5 times a power of ten."""
+    step = 10.0 ** np.floor(np.log10((high - low) / most_steps))
+    step = next(
+        step * factor for factor in (1.0, 2.0, 5.0, 10.0) if step * factor * most_steps >= (high - low) * (1 - 1e-9)
+    )
     first = np.ceil(low / step - 1e-9)
     return [float(step * (first + k)) for k in range(int(np.floor(high / step + 1e-9) - first) + 1)]
 
 
-def visible(time: Array, values: Array, columns: int) -> NDArray[np.intp]:
+def visible_samples(time: Array, values: Array, pixel_columns: int) -> NDArray[np.intp]:
     """Return the indices of the samples that a line needs so that it looks like the line through all of them.
 
     Args:
         time: increasing, shape (samples,).
         values: shape (samples,).
-        columns: how many columns of pixels show the whole time.
+        pixel_columns: how many columns of pixels show the whole time.
 
     Returns:
         Increasing indices: of the lowest and highest sample of every column, the first and the last sample.
     """
-    if len(time) <= 2 * columns:
+    if len(time) <= 2 * pixel_columns:
         return np.arange(len(time))
-    column = np.minimum((time - time[0]) / (time[-1] - time[0]) * columns, columns - 1).astype(int)
+    column = np.minimum((time - time[0]) / (time[-1] - time[0]) * pixel_columns, pixel_columns - 1).astype(int)
     order = np.lexsort((values, column))
     begins = np.flatnonzero(np.diff(column, prepend=-1))
     ends = np.append(begins[1:], len(time)) - 1
@@ -317,11 +319,11 @@ def visible(time: Array, values: Array, columns: int) -> NDArray[np.intp]:
     return np.unique(np.concatenate([[0], order[begins], order[ends], [len(time) - 1]]))
 
 
-def require_drawable(name: str, values: Array, shape: tuple[int, ...], *, unlimited: bool = False) -> None:
+def require_drawable(quantity: str, values: Array, shape: tuple[int, ...], *, unlimited: bool = False) -> None:
     """Raise UsageError for values that cannot be drawn: empty, of another shape, NaN, infinite or huge.
 
     Args:
-        name: name of the values, for the message.
+        quantity: name of the values, for the message.
         values: values to be drawn.
         shape: required shape.
         unlimited: whether infinities may stand for limits that are not there.
@@ -330,13 +332,13 @@ def require_drawable(name: str, values: Array, shape: tuple[int, ...], *, unlimi
         UsageError: nothing in it, another shape, or values that are NaN or (where not `unlimited`) infinite or huge.
     """
     if values.shape != shape:
-        raise UsageError(f"cannot draw {name}: its shape is {values.shape}, not {shape}")
+        raise UsageError(f"cannot draw {quantity}: its shape is {values.shape}, not {shape}")
     if values.size == 0:
-        raise UsageError(f"cannot draw {name}: it is empty")
+        raise UsageError(f"cannot draw {quantity}: it is empty")
     bad = np.isnan(values) | (np.zeros(shape, bool) if unlimited else ~(np.abs(values) < LARGEST))
     if bad.any():
         first = tuple(int(k) for k in np.argwhere(bad)[0])
-        raise UsageError(f"cannot draw {name}: the value at {list(first)} is {values[first]}")
+        raise UsageError(f"cannot draw {quantity}: the value at {list(first)} is {values[first]}")
 
 
 FONT = 12.0
@@ -344,23 +346,25 @@ _LINE = 15.0
 _FEWEST, _MOST = 3, 6  # round numbers along an axis
 
 
-def range_around(*values: Array, least: float = 0.0, zero: bool = False, share: float = 0.06) -> tuple[float, float]:
+def range_around(
+    *values: Array, least_length: float = 0.0, include_zero: bool = False, free_share: float = 0.06
+) -> tuple[float, float]:
     """Return (low, high) of a range that holds all finite values, with room for the lines' own width.
 
     Args:
         values: values, of any shapes.
-        least: least length of the range.
-        zero: whether the range holds zero.
-        share: share of the range that is left free at either end.
+        least_length: least length of the range.
+        include_zero: whether the range holds zero.
+        free_share: share of the range that is left free at either end.
     """
     everything = np.concatenate([np.ravel(one)[np.isfinite(np.ravel(one))] for one in values])
     low, high = (float(everything.min()), float(everything.max())) if len(everything) else (0.0, 0.0)
-    if zero:
+    if include_zero:
         low, high = min(low, 0.0), max(high, 0.0)
-    if high - low <= max(least, 1e-9 * max(abs(low), abs(high))):
-        half = 0.5 * max(least, 1e-9, 0.1 * max(abs(low), abs(high)))
+    if high - low <= max(least_length, 1e-9 * max(abs(low), abs(high))):
+        half = 0.5 * max(least_length, 1e-9, 0.1 * max(abs(low), abs(high)))
         low, high = 0.5 * (low + high) - half, 0.5 * (low + high) + half
-    return low - share * (high - low), high + share * (high - low)
+    return low - free_share * (high - low), high + free_share * (high - low)
 
 
 def draw_frame(
@@ -401,7 +405,7 @@ def draw_frame(
     canvas.text("ink", axes.left, axes.top - 6, y, size=FONT)
 
 
-def draw_key(canvas: Canvas, right: float, y: float, entries: Sequence[tuple[str, str, str]]) -> None:
+def draw_legend(canvas: Canvas, right: float, y: float, entries: Sequence[tuple[str, str, str]]) -> None:
     """Draw a legend of colours and strokes, in one row that ends at `right` [px].
 
     Args:
@@ -432,16 +436,16 @@ def _ticks(low: float, high: float, log: bool, most: int) -> list[tuple[float, s
         while len(values) < _FEWEST and most < 2 * _MOST:
             most += 1
             values = round_values(low, high, most)
-        return [(value, number(value, 6)) for value in values]
+        return [(value, format_number(value, 6)) for value in values]
     step = max(1, int(np.ceil((high - low) / most)))
     first = int(np.ceil(low / step - 1e-9)) * step
     found = [(float(power), _power(power)) for power in range(first, int(np.floor(high + 1e-9)) + 1, step)]
-    return found or [(low, number(10.0**low, 2)), (high, number(10.0**high, 2))]
+    return found or [(low, format_number(10.0**low, 2)), (high, format_number(10.0**high, 2))]
 
 
 def _power(power: int) -> str:
     if -3 <= power <= 3:
-        return number(10.0**power)
+        return format_number(10.0**power)
     return "10" + "".join(
         "\u207b" if sign == "-" else "\u2070\u00b9\u00b2\u00b3\u2074\u2075\u2076\u2077\u2078\u2079"[int(sign)]
         for sign in str(power)

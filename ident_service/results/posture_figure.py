@@ -20,7 +20,7 @@ from ident_service.errors import UsageError
 from ident_service.model.chain import Chain
 from ident_service.model.kinematics import branches, frame_origins
 from ident_service.model.solids import Capsule, HalfSpace, Solid, corners
-from ident_service.results.plots import STEPS, Array, Axes, Canvas, number, require_drawable, round_values
+from ident_service.results.plots import STEPS, Array, Axes, Canvas, format_number, require_drawable, round_values
 
 
 @dataclass(frozen=True)
@@ -240,8 +240,8 @@ def stick_figure(postures: Postures, title: str = "The arm along its motion") ->
     canvas.text("ink strong", 16, 25, title, size=16)
     first, last = postures.times[0], postures.times[-1]
     total = len(postures.times)
-    count = f"{len(shown)} of {total} postures, {number(first, 4)} s to" if total > 1 else "one posture at"
-    canvas.text("soft", 16, 44, f"{count} {number(last, 4)} s", size=12)
+    count = f"{len(shown)} of {total} postures, {format_number(first, 4)} s to" if total > 1 else "one posture at"
+    canvas.text("soft", 16, 44, f"{count} {format_number(last, 4)} s", size=12)
     words = _closest_words(postures)
     if words:
         canvas.line("closest", 18, 63, 42, 63)
@@ -295,7 +295,7 @@ def spike_figure(
     canvas = _views(posture, [0], _NARROW)
     canvas.circle("dot", 22.0, 16.0, 5.0)
     canvas.text("ink", 33.0, 20.0, name, size=12.5)
-    title = f"{name}: residual of {number(residual, 3)} {unit} at {number(time, 4)} s"
+    title = f"{name}: residual of {format_number(residual, 3)} {unit} at {format_number(time, 4)} s"
     return canvas.svg(title, f"Side and top view of the arm in this posture, with {name} marked.", inline=inline)
 
 
@@ -430,9 +430,9 @@ def _closest_words(postures: Postures) -> str:
     if closest is None:
         return ""
     one, other = closest.pair
-    gap = f"{number(abs(1e3 * closest.distance))} mm"
+    gap = f"{format_number(abs(1e3 * closest.distance))} mm"
     apart = f"overlap of {gap}" if closest.distance < 0.0 else gap
-    when = number(float(postures.times[closest.posture]), 4)
+    when = format_number(float(postures.times[closest.posture]), 4)
     return f"Smallest clearance: {one} \u2013 {other}, {apart}, at {when} s"
 
 
@@ -447,12 +447,12 @@ def _grid(canvas: Canvas, axes: Axes, view: tuple[int, int]) -> float:
     for value in values:
         at = float(axes.x(value))
         canvas.line("grid", at, axes.top, at, axes.top + axes.height)
-        canvas.text("soft", at, axes.top + axes.height + 14, number(value, 6), size=10, anchor="middle")
+        canvas.text("soft", at, axes.top + axes.height + 14, format_number(value, 6), size=10, anchor="middle")
     first, last = np.ceil(axes.low_y / step), np.floor(axes.high_y / step)
     for value in step * np.arange(first, last + 1):
         at = float(axes.y(value))
         canvas.line("grid", axes.left, at, axes.left + axes.width, at)
-        canvas.text("soft", axes.left - 5, at + 3.5, number(value, 6), size=10, anchor="end")
+        canvas.text("soft", axes.left - 5, at + 3.5, format_number(value, 6), size=10, anchor="end")
     across, up = (f"{_NAMES[axis]} [m]" for axis in view)
     # At the end, as the scale bar stands at the beginning.
     canvas.text("soft", axes.left + axes.width, axes.top + axes.height + 31, across, anchor="end")
@@ -466,7 +466,7 @@ def _scale_bar(canvas: Canvas, axes: Axes, length: float) -> None:
     canvas.line("rule", left, y, left + wide, y)
     for end in (left, left + wide):
         canvas.line("rule", end, y - 4, end, y + 4)
-    canvas.text("ink", left + wide + 8, y + 4, f"{number(length)} m")
+    canvas.text("ink", left + wide + 8, y + 4, f"{format_number(length)} m")
 
 
 def _legend(canvas: Canvas, right: float, postures: Postures) -> None:

@@ -98,25 +98,29 @@ def read_evidence_of(results: Results) -> Evidence:
     return evidence
 
 
-def make_report(folder: Path, out: Path | None = None) -> tuple[Path, Assessment]:
-    """Write a results folder's report again, to file `out` or to the folder and its manifest; return (page, verdict).
+def make_report(folder: Path, page_file: Path | None = None) -> tuple[Path, Assessment]:
+    """Write a results folder's report again, to `page_file` or to the folder and its manifest; return (page, verdict).
 
     Args:
         folder: folder made by `ident identify` or `ident simulate`.
-        out: path of the page; in the folder, whose manifest then names it, when None.
+        page_file: path of the page; in the folder, whose manifest then names it, when None.
 
     Raises:
         UsageError, ParameterError, ConfigError: the folder is not what its manifest names, or has no evidence.
     """
     results = read_reported(folder)
-    if out is not None and out.is_dir():
-        raise UsageError(f"{out}: is a folder; give the name of a file")
-    if out is not None:
-        require_folder_of(out)
-    if out is not None and out.name in {*results.sha256, MANIFEST} - {REPORT_PAGE} and out.parent.samefile(folder):
-        raise UsageError(f"{out}: is one of the results; give another name")
+    if page_file is not None and page_file.is_dir():
+        raise UsageError(f"{page_file}: is a folder; give the name of a file")
+    if page_file is not None:
+        require_folder_of(page_file)
+    if (
+        page_file is not None
+        and page_file.name in {*results.sha256, MANIFEST} - {REPORT_PAGE}
+        and page_file.parent.samefile(folder)
+    ):
+        raise UsageError(f"{page_file}: is one of the results; give another name")
     page = report_html(read_evidence_of(results), results.parameters, results.config, _others(results.sha256))
-    path = folder / REPORT_PAGE if out is None else out
+    path = folder / REPORT_PAGE if page_file is None else page_file
     write_atomically(path, page)
     if path.name == REPORT_PAGE and path.parent.samefile(folder):
         write_manifest(folder)
@@ -132,13 +136,13 @@ _SCALE = 3.0  # pixels of a PNG per pixel of the drawing; 560 become 1680, 300 d
 _FONTS = ("DejaVu Sans", "Liberation Sans", "Noto Sans", "Arial", "Helvetica")
 
 
-def write_figures(run: Path, out: Path, form: Literal["svg", "png"]) -> list[str]:
+def write_figures(results_folder: Path, figures_folder: Path, image_format: Literal["svg", "png"]) -> list[str]:
     """Write every drawing of a report as SVG or PNG files into a folder; return their names.
 
     Args:
-        run: folder of results with evidence.
-        out: folder to write into.
-        form: format of the files.
+        results_folder: folder of results with evidence.
+        figures_folder: folder to write into.
+        image_format: format of the files.
 
     Returns:
         The names of the files, in the order of the report.
@@ -147,15 +151,15 @@ def write_figures(run: Path, out: Path, form: Literal["svg", "png"]) -> list[str
         UsageError: nothing can be written there, the folder has no evidence, or PNG without its library or any font.
         ParameterError, ConfigError: the folder is not what its manifest names.
     """
-    rendered = _png() if form == "png" else str.encode
-    results = read_reported(run)
-    if out.exists() and out.samefile(run):
-        raise UsageError(f"{out}: holds the results; give another folder")
+    rendered = _png() if image_format == "png" else str.encode
+    results = read_reported(results_folder)
+    if figures_folder.exists() and figures_folder.samefile(results_folder):
+        raise UsageError(f"{figures_folder}: holds the results; give another folder")
     drawn = figures(read_evidence_of(results), results.parameters).all()
-    with atomic_folder(out) as staging:
+    with atomic_folder(figures_folder) as staging:
         for figure in drawn:
-            (staging / f"{figure.slug}.{form}").write_bytes(rendered(figure.svg()))
-    return [f"{figure.slug}.{form}" for figure in drawn]
+            (staging / f"{figure.slug}.{image_format}").write_bytes(rendered(figure.svg()))
+    return [f"{figure.slug}.{image_format}" for figure in drawn]
 
 
 def _png() -> Callable[[str], bytes]:

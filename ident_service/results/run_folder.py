@@ -72,7 +72,7 @@ def read_results(folder: Path) -> Results:
 def write_results(
     folder: Path,
     estimate: Estimate,
-    more: dict[str, Any] | None = None,
+    more_entries: dict[str, Any] | None = None,
     unusable: Sequence[str] = (),
     described: ArmConfig | None = None,
     torque: str = "commanded",
@@ -82,7 +82,7 @@ def write_results(
     Args:
         folder: folder to write.
         estimate: estimate to write.
-        more: further entries of `parameters.json`.
+        more_entries: further entries of `parameters.json`.
         unusable: reasons why the estimate must not be used.
         described: the arm's description as it was read, where options or recordings changed it.
         torque: kind of torque in the recordings: `measured` by the drives, `commanded`, or `recorded` by another
@@ -91,7 +91,9 @@ def write_results(
     Returns:
         The names of the files. An estimate that no body has comes without a URDF, because URDF cannot express it.
     """
-    document = parameters_document(estimate, described) | {"unusable": list(unusable), "torque": torque} | (more or {})
+    document = (
+        parameters_document(estimate, described) | {"unusable": list(unusable), "torque": torque} | (more_entries or {})
+    )
     write_parameters(folder / PARAMETERS, document)
     write_atomically(folder / ARM, estimate.model.config.model_dump_json(indent=1) + "\n")
     names = [PARAMETERS, ARM]

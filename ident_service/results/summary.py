@@ -205,25 +205,25 @@ def summary(
     return "\n".join(lines) + "\n"
 
 
-def assessment_lines(found: Assessment) -> list[str]:
+def assessment_lines(assessment: Assessment) -> list[str]:
     """Return the verdict, its reasons and a row per joint, as lines for a terminal.
 
     Args:
-        found: assessment to show.
+        assessment: assessment to show.
     """
-    head = found.word.upper() + found.line[len(found.word) :]
-    if found.word == "do not use":
+    head = assessment.word.upper() + assessment.line[len(assessment.word) :]
+    if assessment.word == "do not use":
         head = "DO NOT USE these parameters:"
-    lines = [*wrapped([head]), *(line for reason in found.reasons for line in _bullet(reason))]
-    if found.further:
-        lines += ["further:", *(line for reason in found.further for line in _bullet(reason))]
-    if not found.joints:
+    lines = [*wrapped([head]), *(line for reason in assessment.reasons for line in _bullet(reason))]
+    if assessment.further:
+        lines += ["further:", *(line for reason in assessment.further for line in _bullet(reason))]
+    if not assessment.joints:
         return lines
-    unseen = any(joint.unseen is not None for joint in found.joints)
+    unseen = any(joint.unseen is not None for joint in assessment.joints)
     heads = ["fitted", "moving", *(["unseen", "moving"] if unseen else []), "residual rms"]
-    width = max(len("torque error [%]"), *(len(joint.joint) for joint in found.joints))
+    width = max(len("torque error [%]"), *(len(joint.joint) for joint in assessment.joints))
     lines += ["", f"{'torque error [%]':{width}s}" + "".join(f" {head:>14s}" for head in heads) + "  verdict"]
-    for joint in found.joints:
+    for joint in assessment.joints:
         values = [joint.fitted, joint.fitted_moving, *([joint.unseen, joint.unseen_moving] if unseen else [])]
         cells = ["" if value is None else f"{value:.2f}" for value in values]
         cells.append("" if joint.residual is None else f"{joint.residual:.3g} {joint.unit}")

@@ -62,10 +62,10 @@ def columns(path: Path) -> dict[str, dict[str, Any]]:
 
 @pytest.fixture(scope="module")
 def saved(quick: Commissioned, tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
-    from ident_service.operations.run_view import view_run
+    from ident_service.operations.run_view import show_run_in_viewer
 
     path = tmp_path_factory.mktemp("view") / "run.rrd"
-    seen = view_run(quick.folder, save=path)
+    seen = show_run_in_viewer(quick.folder, save_file=path)
     assert seen.recordings == seen.residuals == ("identification", "validation")
     assert [one.name for one in path.parent.iterdir()] == ["run.rrd"]
     return columns(path)

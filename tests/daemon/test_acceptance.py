@@ -108,7 +108,7 @@ def test_a_set_that_was_changed_behind_our_back_is_not_rolled_back_to(db: Databa
     with pytest.raises(ParameterError, match="was changed since"):
         rollback(db, state, "quick", "back", "me")
     with pytest.raises(UsageError, match="from 1 to 2"):
-        rollback(db, state, "quick", "back", "me", to=3)
+        rollback(db, state, "quick", "back", "me", acceptance_number=3)
 
 
 def test_a_folder_from_another_machine_is_imported_whole(db: Database, state: Path, folder: Path) -> None:

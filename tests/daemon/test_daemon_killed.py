@@ -21,7 +21,7 @@ from ident_service.client import IdentClient
 from ident_service.daemon.jobs.child_process import alive
 from ident_service.errors import ArmError, MotionRefused
 from ident_service.motion.command_channel import controlling_pid, in_use
-from ident_service.operations.moving_arms import held_arm
+from ident_service.operations.moving_arms import is_held
 from ident_service.recordings.open import open_recording
 from ident_service.registry.database import Database
 from ident_service.registry.jobs import known_job
@@ -168,7 +168,7 @@ def test_an_arm_that_is_held_when_the_daemon_is_killed_is_reported_and_let_down_
             client.job(motion.id)
         assert f"`ident jobs show {motion.id}` tells how the motion ended" in str(caught.value)
         begun = motion.id
-    wait_for(lambda: held_arm(state, ARM))
+    wait_for(lambda: is_held(state, ARM))
     # At the terminal the name is known without a daemon.
     assert main(["recover", ARM, "--state", str(state)]) == 3
     assert "Support the arm, then `ident supported quick`: process " in capsys.readouterr().out
@@ -194,7 +194,7 @@ def test_an_arm_that_is_held_when_the_daemon_is_killed_is_reported_and_let_down_
         assert words.startswith(f"waits for {begun}, which holds the arm quick until a person confirms")
         assert time.monotonic() - started < 30.0  # and not the 40 s for which processes were looked for
         assert client.arm(ARM).stop()["arms"] == [ARM]
-        assert held_arm(state, ARM)
+        assert is_held(state, ARM)
         words = ["--server", client.url, "--state", str(state)]
         assert main(["supported", ARM, "--confirm", ARM, *words]) == 0
         told = wait_for(lambda: "the motion ended: stopped" in client.job(begun).detail and client.job(begun))

@@ -45,11 +45,11 @@ def numbers(news: list[Any]) -> list[int]:
 def test_what_happens_is_reported_once_and_in_order(daemon: Asked, watch: EventPoller) -> None:
     db = daemon.service.db
     seen, late = watch.begin(None), watch.begin(None)
-    watch.look()
+    watch.poll()
     assert watch.since(seen) == []
     for number in range(5):
         note(db, "me", "did", str(number))
-    watch.look()
+    watch.poll()
     lines = [line["id"] for line in reversed(audit_log(db)) if line["what"] == "did"]
     assert numbers(watch.since(seen)) == lines
     assert watch.since(seen) == []
@@ -63,7 +63,7 @@ def test_who_is_far_behind_reads_the_registry(
     db = daemon.service.db
     for number in range(40):
         note(db, "me", "did", str(number))
-    watch.look()
+    watch.poll()
     seen, told = watch.begin(0), list[int]()
     assert watch.behind(seen)
     while watch.behind(seen):
@@ -81,16 +81,16 @@ def test_a_new_listener_gets_the_state_of_arms_and_jobs(daemon: Asked, watch: Ev
     fault_file(state, "planar2").latch("overspeed", "too fast")
     with ControlFile.take(control_path(state, "wam7_sim"), None):
         job = daemon.begin({"kind": "base", "arm": "planar2"})
-        watch.look()
+        watch.poll()
         seen = watch.begin(None)
         standing = {one.kind: one.data for one in watch.since(seen) if one.number is None}
         assert '"faults": ["overspeed"]' in standing["arm"] or '"moves": true' in standing["arm"]
         assert job["id"] in standing["job"]
-        watch.look()
+        watch.poll()
         again = [one for one in watch.since(seen) if one.kind == "arm"]
         assert again == []  # nothing has changed
     daemon.follow(job["id"])
-    watch.look()
+    watch.poll()
     told = {one.kind: one.data for one in watch.since(seen)}
     assert '"done"' in told["job"]
     assert '"moves": false' in told["arm"]

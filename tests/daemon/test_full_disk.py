@@ -24,7 +24,7 @@ from ident_service.cli import main
 from ident_service.client import IdentClient
 from ident_service.errors import ArmError, ArmFault, UsageError
 from ident_service.motion.command_channel import ControlFile, in_use
-from ident_service.operations.moving_arms import held_arm
+from ident_service.operations.moving_arms import is_held
 from ident_service.registry import jobs as rows
 from ident_service.registry.database import FILE, Database, audit_log, note
 from ident_service.registry.state_folder import control_path
@@ -308,7 +308,7 @@ def test_a_disk_that_fills_while_an_arm_without_brakes_moves_is_reported_while_i
                     filled.append(fill(small))
         assert job.ended.held
         assert client.job(job.id).state == "running"
-        assert held_arm(state, "quick")
+        assert is_held(state, "quick")
         # The disk is still full when the motion ends: its end waits for room, and is told of once.
         client.arm("quick").supported(confirm="quick")
         wait_for(lambda: not in_use(control_path(state, "quick")))

@@ -315,7 +315,7 @@ def test_an_arm_that_was_deleted_stands_nowhere(daemon: Asked, state: Path) -> N
 
     def standing() -> list[str]:
         time.sleep(LOOK)
-        watch.look()
+        watch.poll()
         return [json.loads(one.data)["arm"] for one in watch.since(watch.begin(None)) if one.kind == "arm"]
 
     assert standing() == ["quick"]

@@ -103,7 +103,7 @@ def test_few_descriptions_are_checked_at_a_time(daemon: Asked) -> None:
     good = {"description": "extends: planar2\nname: other\n"}
     with ExitStack() as taken:
         for _ in range(MOST_CHECKS):
-            taken.enter_context(daemon.service.checks.place())
+            taken.enter_context(daemon.service.checks.slot())
         for door in ("arms", "descriptions/check"):
             answer = daemon.post(f"/api/v1/{door}", good)
             assert (answer.status_code, answer.headers["retry-after"]) == (503, "2"), answer.text

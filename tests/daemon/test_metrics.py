@@ -59,7 +59,7 @@ def test_jobs_are_counted_when_they_have_ended(daemon: Asked) -> None:
 def test_the_age_of_a_lease_is_that_of_its_renewal(daemon: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
     engine, now = daemon.service.engine, [100.0]
     monkeypatch.setattr(engine.live, "_now", lambda: now[0])
-    monkeypatch.setattr(engine.live, "free", lambda live, computing: False)  # it waits
+    monkeypatch.setattr(engine.live, "may_begin", lambda live, most_computing: False)  # it waits
     monkeypatch.setattr(engine, "_now", lambda: now[0])
     job = engine.create(Run(kind="run", arm="planar2"), "owner")["id"]
     for seconds in (0.3, 1.6):
@@ -77,7 +77,7 @@ def test_lateness_is_the_sum_of_the_runs() -> None:
     for time_ns in (500, 1_500, 1_500, 40_000, 10**9):
         late.add(time_ns)
     for document in (late.document(), late.document(), None, {"edges_us": [1], "counts": [1]}, {"edges_us": "x"}):
-        metrics.lateness(document)
+        metrics.add_lateness(document)
     found = figures(metrics.text({}, (), {}, {}, {}))
     buckets = {
         float(dict(labels)["le"]): value

@@ -43,8 +43,8 @@ def figures(daemon: Asked) -> dict[str, set[str]]:
     fault_file(daemon.service.state, "planar2").latch("overspeed", "too fast")
     daemon.post("/api/v1/stop")
     metrics = daemon.service.metrics
-    metrics.renewed(0.5)
-    metrics.job("run", "done", 1.0, 20.0)
+    metrics.record_lease_age(0.5)
+    metrics.record_job("run", "done", 1.0, 20.0)
     daemon.service.db.write(
         "INSERT INTO alarms (arm, reidentification, run, what, at) VALUES ('planar2', 'r', 'r', 'x', 0)"
     )

@@ -24,7 +24,7 @@ from daemon.verbs_bench import ON_A_BUS, on_a_bus, singular_copy, unstable_text
 
 from ident_service.cli import main, parser
 from ident_service.cli.arguments import LOCAL_ONLY, Parser
-from ident_service.cli.remote import follow, table
+from ident_service.cli.remote import follow, remote_verbs
 from ident_service.cli.remote_watching import named_files
 from ident_service.client import IdentClient
 from ident_service.errors import ArmError, ConfigError, MotionRefused, Problem, UnknownId, UsageError
@@ -50,7 +50,7 @@ def verbs() -> dict[str, Parser]:
 
 @pytest.mark.slow
 def test_every_verb_is_done_by_a_daemon_or_says_why_not() -> None:
-    done = table()
+    done = remote_verbs()
     assert len(verbs()) > 45
     assert set(done) | set(LOCAL_ONLY) == set(verbs())
     assert not set(done) & set(LOCAL_ONLY)
@@ -131,7 +131,7 @@ def test_a_stop_tells_arms_and_jobs_apart() -> None:
             return self.answer
 
     def said(arms: list[str], jobs: list[str]) -> str:
-        return table()["stop"][0](Answering(arms, jobs), parser().parse_args(["stop", "--server", "x"]))[1]
+        return remote_verbs()["stop"][0](Answering(arms, jobs), parser().parse_args(["stop", "--server", "x"]))[1]
 
     assert said(["a", "b"], ["j1"]) == "stop requested of a, b; cancelled: job j1\n"
     assert said([], ["j1", "j2"]) == "cancelled: job j1, job j2\n"
@@ -149,7 +149,7 @@ def test_a_stop_of_a_name_that_is_no_arm_is_an_error() -> None:
             raise UnknownId("no arm 'planr2' is known")
 
     with pytest.raises(UsageError, match="planr2: the daemon has no arm of this name, so nothing was stopped"):
-        table()["stop"][0](Refusing(), parser().parse_args(["stop", "planr2", "--server", "x"]))
+        remote_verbs()["stop"][0](Refusing(), parser().parse_args(["stop", "planr2", "--server", "x"]))
 
 
 def test_mistakes_in_a_description_that_was_sent_have_its_own_name(tmp_path: Path) -> None:
@@ -168,10 +168,10 @@ def test_mistakes_in_a_description_that_was_sent_have_its_own_name(tmp_path: Pat
     mine.write_text("name: bench\n")
     words = parser().parse_args(["config", "check", str(mine), "--server", "x"])
     with pytest.raises(ConfigError) as told:
-        table()["config check"][0](Judging(), words)
+        remote_verbs()["config check"][0](Judging(), words)
     assert str(told.value) == f"{mine}:8:1: gravity: wrong\nbase.yaml:1:2: name: wrong"
     mistakes.clear()
-    code, text, _ = table()["config check"][0](Judging(), words)
+    code, text, _ = remote_verbs()["config check"][0](Judging(), words)
     assert (code, text) == (3, f"{mine}: bench: CANNOT MOVE\n  {mine}:3:1: joints: wrong\n")
 
 
@@ -301,7 +301,7 @@ def test_a_command_renews_no_lease_of_a_motion_that_is_ending() -> None:
             return running | {"state": "cancelled" if asked.count(path) == 3 else "running"}
 
     words = argparse.Namespace(json=True)
-    ended = follow(cast(IdentClient, Daemon()), words, running, lambda: False, moves=True, every=0.02)
+    ended = follow(cast(IdentClient, Daemon()), words, running, lambda: False, moves=True, poll_seconds=0.02)
     assert ended["state"] == "cancelled"
     assert asked == ["/api/v1/jobs/j/lease", *["/api/v1/jobs/j"] * 3]
 

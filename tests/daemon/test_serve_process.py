@@ -20,9 +20,9 @@ from daemon.served import daemon_process
 from ident_service.cli import main
 from ident_service.client import IdentClient
 from ident_service.daemon.jobs.child_process import ANSWER, LOG, PROCESS, UnitChild, alive, name_of
-from ident_service.daemon.jobs.commands import command
+from ident_service.daemon.jobs.commands import command_of_request
 from ident_service.daemon.jobs.requests import Watch
-from ident_service.daemon.jobs.socket_activation import taken
+from ident_service.daemon.jobs.socket_activation import is_allowed
 from ident_service.daemon.serve import notify_systemd, watchdog_seconds
 from ident_service.errors import ArmError, MotionRefused, UnknownId, UsageError
 from ident_service.motion.command_channel import ControlFile
@@ -244,7 +244,7 @@ def test_a_unit_of_its_own_does_motions_under_a_lease_and_nothing_else(state: Pa
     # What looks may not move; argparse would take the beginning of an option for the whole.
     forbidden += [["bus", "load", "planar2"], ["token", "list"]]
     forbidden += [["recover", "planar2", option, "--json"] for option in ("--leave-limit", "--leave", "--l", "--out=x")]
-    assert not any(map(taken, forbidden))
+    assert not any(map(is_allowed, forbidden))
     for words in forbidden:
         code, said = motion_unit(folder, {"folder": str(folder), "words": words})
         assert (code, "only motions" in said) == (2, True), words
@@ -260,7 +260,7 @@ def test_a_unit_of_its_own_does_motions_under_a_lease_and_nothing_else(state: Pa
     looks.mkdir()
     with Database(state) as db:
         know_shipped(db)
-        seen = command(db, state, Watch(kind="watch", arm="planar2", seconds=0.1)).words
+        seen = command_of_request(db, state, Watch(kind="watch", arm="planar2", seconds=0.1)).words
     assert motion_unit(looks, {"folder": str(looks), "words": list(seen)})[0] == 0
     answer = json.loads((looks / ANSWER).read_text())
     assert (answer["exit_code"], " cycles, 0 frames lost\n" in answer["text"]) == (0, True)

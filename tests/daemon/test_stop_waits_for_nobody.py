@@ -167,7 +167,7 @@ def test_a_stop_at_a_terminal_reaches_what_waits_in_the_daemon(
 ) -> None:
     with ControlFile.take(control_path(state, "planar2"), None):
         # The arm is in use, and something else has its place in the queue: neither of them begins.
-        daemon.service.engine.live.free = lambda live, computing: False  # type: ignore[method-assign]
+        daemon.service.engine.live.may_begin = lambda live, most_computing: False  # type: ignore[method-assign]
         jobs = [daemon.begin({"kind": "home", "arm": arm}, confirmed=True)["id"] for arm in ("planar2", "sixaxis")]
         assert main(["stop", "planar2", "--state", str(state)]) == 0
         assert daemon.follow(jobs[0])["detail"] == "a stop was requested"

@@ -12,7 +12,7 @@ from daemon.conftest import Asked, quick_text, serving
 from daemon.test_access_control import refusal
 from daemon.verbs_bench import ON_A_BUS, answered, on_a_bus, singular_copy, unstable_text, with_arms, with_run
 
-from ident_service.daemon.jobs.commands import command
+from ident_service.daemon.jobs.commands import command_of_request
 from ident_service.daemon.jobs.requests import BusScan, Zero
 from ident_service.daemon.request_guard import MOST_UPLOAD
 from ident_service.operations.acceptance import accept
@@ -123,7 +123,7 @@ def test_buses_and_descriptions(daemon: Asked, state: Path) -> None:
     assert (ended["state"], said["stability"]["stable"]) == ("done", True)
     # Who looks at a bus has it for itself.
     arm = known_arm(daemon.service.db, state, ON_A_BUS)
-    order = command(daemon.service.db, state, BusScan(kind="bus_scan", arm=ON_A_BUS))
+    order = command_of_request(daemon.service.db, state, BusScan(kind="bus_scan", arm=ON_A_BUS))
     assert order.resources == resources(arm.config) == (f"arm {ON_A_BUS}",)
     assert not order.moves
 
@@ -178,7 +178,7 @@ def test_zeroing_waits_for_nothing(state: Path, monkeypatch: pytest.MonkeyPatch)
         monkeypatch.setattr(daemon.service.engine, "_look", lambda: None)  # nothing begins
         db = daemon.service.db
         asked = Zero(kind="zero", arm=ON_A_BUS)
-        assert command(db, state, asked).resources == (f"arm {ON_A_BUS}",)
+        assert command_of_request(db, state, asked).resources == (f"arm {ON_A_BUS}",)
         daemon.begin({"kind": "recover", "arm": ON_A_BUS})
         body = {"job": {"kind": "zero", "arm": ON_A_BUS}}
         for _ in range(2):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from made_recordings import moving, whole
 
 from ident_service.cli import main
-from ident_service.cli.remote_recordings import recording
+from ident_service.cli.remote_recordings import recording_reference
 from ident_service.client import IdentClient
 from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
@@ -224,7 +224,7 @@ class Knowing(IdentClient):
 def remote_recording(path: Path) -> dict[str, object]:
     """Name a recording of a daemon, which is asked for nothing else."""
     client = Knowing("http://127.0.0.1:1", "token")
-    return recording(client, argparse.Namespace(json=True), "planar2", path)
+    return recording_reference(client, argparse.Namespace(json=True), "planar2", path)
 
 
 def test_a_daemon_is_sent_the_same_range() -> None:

@@ -26,7 +26,7 @@ from ident_service.config.load import load_arm, shipped_arms
 from ident_service.config.quantities import TextFile
 from ident_service.errors import ConfigError, DriverError, UsageError
 from ident_service.operations.description_check import check_description
-from ident_service.operations.fieldbus import Probe, bus_probe, keep_outcome, probe_document, probe_text
+from ident_service.operations.fieldbus import Probe, bus_probe, probe_document, probe_text, store_probe_outcome
 from sim_backend.canopen_device.drive import CanopenDrive
 from sim_backend.emulator.process import emulate
 
@@ -402,15 +402,15 @@ def test_a_drive_that_cannot_keep_a_zero_is_reported() -> None:
 def test_what_a_probe_found_is_kept_and_what_differs_is_reported(tmp_path: Path) -> None:
     path, can = tmp_path / "arms" / "a" / "drives.json", {"identity": {"vendor": 1}, "mode": 10, "asked": True}
     drive = {"title": "drive 1", "node": 3, "silent": "", "can": can}
-    assert keep_outcome(path, {"drives": [drive]}) == []
-    assert keep_outcome(path, {"drives": [drive | {"silent": "no answer"}]}) == []
-    (line,) = keep_outcome(path, {"drives": [drive | {"can": can | {"mode": 4}}]})
+    assert store_probe_outcome(path, {"drives": [drive]}) == []
+    assert store_probe_outcome(path, {"drives": [drive | {"silent": "no answer"}]}) == []
+    (line,) = store_probe_outcome(path, {"drives": [drive | {"can": can | {"mode": 4}}]})
     assert line.startswith("drive 1, node 3: mode was 10, is 4 (probe of ")
-    (line,) = keep_outcome(path, {"drives": [drive | {"can": can | {"identity": {"vendor": 2}}}]})
+    (line,) = store_probe_outcome(path, {"drives": [drive | {"can": can | {"identity": {"vendor": 2}}}]})
     assert "another drive than at the last probe" in line
     path.write_text("{")
     with pytest.raises(UsageError, match=r"cannot be read .*remove the file"):
-        keep_outcome(path, {"drives": [drive]})
+        store_probe_outcome(path, {"drives": [drive]})
 
 
 def test_emulated_drives_need_files_that_are_there(capsys: pytest.CaptureFixture[str]) -> None:

@@ -31,10 +31,10 @@ from ident_service.errors import IdentError, ModelError
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.urdf import urdf_text
 from ident_service.results.export import urdf as urdf_file
-from ident_service.results.export.bodies import is_real, moved
+from ident_service.results.export.bodies import in_other_frame, is_real
 from ident_service.results.export.identified_arm import IdentifiedArm
 from ident_service.results.export.round_trip import supported_terms
-from ident_service.results.export.urdf import original_urdf, urdf_export, xml_places
+from ident_service.results.export.urdf import original_urdf, parse_xml_with_places, urdf_export
 
 Array = np.ndarray
 
@@ -130,7 +130,7 @@ def torque_in_pinocchio(arm: IdentifiedArm, text: str) -> Array:
 
 def link_bodies(text: str) -> dict[str, Array]:
     """Each link's own ten parameters, read by pinocchio from a file in which every link moves by itself."""
-    root = xml_places(text, "x")
+    root = parse_xml_with_places(text, "x")
     bodies = {}
     for link in root.all("link"):
         if link.first("inertial") is None:
@@ -310,7 +310,7 @@ def test_random_files_take_other_bodies(seed: int, joints: int, square: bool) ->
 def test_elements_are_found_at_their_places_in_the_text(mark: str) -> None:
     """Cut out of the text by their places, against Python's own tree."""
     data = (mark + FOREIGN).encode()
-    pairs = [(xml_places(mark + FOREIGN, "arm.urdf"), ET.fromstring(FOREIGN.encode()))]  # noqa: S314  # ours
+    pairs = [(parse_xml_with_places(mark + FOREIGN, "arm.urdf"), ET.fromstring(FOREIGN.encode()))]  # noqa: S314  # ours
     count = 0
     while pairs:
         found, meant = pairs.pop()
@@ -347,12 +347,12 @@ def test_hostile_files_are_refused(tmp_path: Path, kind: str) -> None:
 def test_the_editor_refuses_them_too(kind: str) -> None:
     old, new = HOSTILE[kind]
     with pytest.raises(ModelError, match=r"arm\.urdf: (a document type or entities are refused|not XML)"):
-        xml_places(re.sub(r"<robot\s+", "<robot ", FOREIGN).replace(old, new, 1), "arm.urdf")
+        parse_xml_with_places(re.sub(r"<robot\s+", "<robot ", FOREIGN).replace(old, new, 1), "arm.urdf")
 
 
 def test_the_editor_refuses_bottomless_files() -> None:
     with pytest.raises(ModelError, match="more than 200 elements in one another"):
-        xml_places("<a>" * 300 + "</a>" * 300, "arm.urdf")
+        parse_xml_with_places("<a>" * 300 + "</a>" * 300, "arm.urdf")
 
 
 def test_a_link_without_mass_is_refused(tmp_path: Path) -> None:
@@ -381,13 +381,15 @@ def test_bodies_move_as_pinocchio_moves_them() -> None:
     xx, xy, xz, yy, yz, zz, x, y, z, m = body
     inertia = pin.Inertia.FromDynamicParameters(np.array([m, x, y, z, xx, xy, yy, xz, yz, zz]))
     there = inertia.se3Action(pin.SE3(rotation, translation)).toDynamicParameters()
-    np.testing.assert_allclose(moved(body, rotation, translation)[[9, 6, 7, 8, 0, 1, 3, 2, 4, 5]], there, atol=1e-12)
+    np.testing.assert_allclose(
+        in_other_frame(body, rotation, translation)[[9, 6, 7, 8, 0, 1, 3, 2, 4, 5]], there, atol=1e-12
+    )
 
 
 def test_what_is_no_body_is_distinguished_from_what_is() -> None:
     body = random_body(np.random.default_rng(3))
     assert is_real(body)
-    assert is_real(moved(body, np.eye(3), np.array([100.0, 0.0, 0.0])))
+    assert is_real(in_other_frame(body, np.eye(3), np.array([100.0, 0.0, 0.0])))
     heavy = body.copy()
     heavy[0] += 10.0  # no triangle
     assert not is_real(heavy)

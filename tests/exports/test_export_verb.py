@@ -25,7 +25,7 @@ from ident_service.results import report_files
 from ident_service.results.assessment import assess
 from ident_service.results.export import formats
 from ident_service.results.export.round_trip import RecordedMotion, unsupported_terms
-from ident_service.results.export.words import plain
+from ident_service.results.export.words import comment_text
 from ident_service.results.run_folder import write_manifest, write_results
 
 ALL = ["planar2.csv", "planar2.json", "planar2.sdf", "planar2.urdf", "planar2.xml", "planar2_dynamics.h"]
@@ -226,7 +226,7 @@ def test_what_is_exported_anyway_is_marked_in_every_file(
     assert json.loads(texts.pop(".json"))["unusable"] == [why]
     assert texts.pop(".csv").splitlines()[1].startswith("do not use,")
     for suffix, text in texts.items():
-        assert "DO NOT USE: " + plain(why) in " ".join(text.replace("\n * ", " ").split()), suffix
+        assert "DO NOT USE: " + comment_text(why) in " ".join(text.replace("\n * ", " ").split()), suffix
 
 
 def test_the_report_of_what_must_not_be_used_leads_to_no_export(

@@ -43,7 +43,7 @@ class Scene:
     def __init__(self, db: Database, state: Path, clock: Clock) -> None:
         self.db, self.state, self.clock = db, state, clock
         self.restart()
-        self.scheduler.look()
+        self.scheduler.do_pass()
 
     def restart(self) -> None:
         """Another process on the same state folder."""
@@ -58,7 +58,7 @@ class Scene:
         """A schedule of six o'clock, and its time has come."""
         add_schedule(self.db, ARM, DueRule(cron="0 6 * * *"), "me", self.clock())
         self.clock.at = MONDAY + 6 * HOUR - 0.5
-        self.scheduler.look()
+        self.scheduler.do_pass()
         self.clock.forward(1.0)
 
     def ended(self, state: str = "done", answer: object = None, detail: str = "") -> None:
@@ -68,7 +68,7 @@ class Scene:
             (self.state / JOBS / job / "answer.json").write_text(json.dumps(answer))
         jobs.ended(self.db, job, state, detail)
         self.engine.live._jobs.pop(job)
-        self.scheduler.look()
+        self.scheduler.do_pass()
 
     @property
     def only(self) -> Row:
@@ -96,7 +96,7 @@ def test_an_arm_whose_description_says_nothing_never_moves_by_itself(scene: Scen
     assert load_arm("planar2").unattended_motion == "refused"
     scene.at_six()
     for _ in range(3):
-        scene.scheduler.look()
+        scene.scheduler.do_pass()
     assert len(pending(scene.db, ARM)) == 1
     assert scene.queued == []
     assert reidentifications(scene.db) == []
@@ -105,7 +105,7 @@ def test_an_arm_whose_description_says_nothing_never_moves_by_itself(scene: Scen
         scene.scheduler.reidentifications.begin(ReidentificationRequest(ARM, unattended=True), "service")
     # A description that allows it later does not set off what waits already.
     scene.allow()
-    scene.scheduler.look()
+    scene.scheduler.do_pass()
     assert scene.queued == []
 
 
@@ -113,7 +113,7 @@ def test_only_an_allowed_arm_begins_and_by_a_preflight_under_our_own_lease(scene
     scene.allow()
     scene.at_six()
     for _ in range(3):
-        scene.scheduler.look()
+        scene.scheduler.do_pass()
     assert scene.queued == [("check", True)]
     assert (scene.only["begun_by"], scene.only["unattended"], scene.only["against"]) == ("service", 1, 1)
     scene.ended()
@@ -123,10 +123,10 @@ def test_only_an_allowed_arm_begins_and_by_a_preflight_under_our_own_lease(scene
 def test_a_preflight_that_is_refused_begins_no_run_and_asks_for_a_person(scene: Scene) -> None:
     scene.allow()
     scene.at_six()
-    scene.scheduler.look()
+    scene.scheduler.do_pass()
     scene.ended("refused", detail="gravity torque is not the model's")
     for _ in range(3):
-        scene.scheduler.look()
+        scene.scheduler.do_pass()
     assert (scene.only["state"], scene.queued) == ("refused", [])
     assert "gravity torque" in scene.only["detail"]
     assert len(pending(scene.db, ARM)) == 1
@@ -135,10 +135,10 @@ def test_a_preflight_that_is_refused_begins_no_run_and_asks_for_a_person(scene: 
 def test_a_run_that_was_refused_is_not_named(scene: Scene) -> None:
     scene.scheduler.reidentifications.begin(ReidentificationRequest(ARM), "ann")
     scene.ended("done")
-    scene.scheduler.look()
+    scene.scheduler.do_pass()
     assert (scene.only["step"], scene.only["recorded"] is None) == ("run", False)
     scene.ended("refused", detail="the arm is in use")
-    scene.scheduler.look()
+    scene.scheduler.do_pass()
     assert scene.only["state"] == "refused"
     assert (scene.only["recorded"], scene.only["run"]) == (None, None)
 
@@ -177,7 +177,7 @@ def test_what_stands_against_it_asks_for_a_person_for_good(scene: Scene, spoil: 
     if spoil is not _disabled:
         scene.at_six()
     words = spoil(scene)
-    scene.scheduler.look()
+    scene.scheduler.do_pass()
     assert scene.why
     assert all(words in why for why in scene.why)
     # Neither an acknowledged fault nor a free arm sets off what was refused before.
@@ -187,7 +187,7 @@ def test_what_stands_against_it_asks_for_a_person_for_good(scene: Scene, spoil: 
     for row in jobs.queue(scene.db):
         jobs.ended(scene.db, row["id"], "cancelled", "")
     scene.clock.forward(1.0)
-    scene.scheduler.look()
+    scene.scheduler.do_pass()
     assert reidentifications(scene.db) == []
 
 
@@ -197,7 +197,7 @@ def test_a_stop_between_the_steps_is_a_stop(scene: Scene) -> None:
     jobs.ended(scene.db, job, "done", "")
     scene.engine.live._jobs.pop(job)
     assert scene.engine.stop(ARM, "bob") == {"arms": [], "jobs": []}  # nothing moves at this moment
-    scene.scheduler.look()
+    scene.scheduler.do_pass()
     assert (scene.only["state"], scene.queued) == ("cancelled", [])
     assert "a stop was requested" in scene.only["detail"]
     # The next one is not stopped by it.
@@ -216,7 +216,7 @@ def test_a_restart_after_the_preflight_does_not_begin_the_run(scene: Scene) -> N
     scene.scheduler.reidentifications.begin(ReidentificationRequest(ARM), "ann")
     jobs.ended(scene.db, scene.only["job"], "done", "")
     scene.restart()
-    scene.scheduler.look()
+    scene.scheduler.do_pass()
     assert (scene.only["state"], scene.queued) == ("interrupted", [])
     assert "nothing has moved since" in scene.only["detail"]
 
@@ -227,11 +227,11 @@ def test_a_restart_during_a_motion_is_reported_when_it_is_known(scene: Scene, ru
     if running:
         jobs.started(scene.db, scene.only["job"], "")
     scene.restart()
-    scene.scheduler.look()
+    scene.scheduler.do_pass()
     if running:  # its process is being looked for
         assert scene.only["state"] == "running"
         explain_interrupted(scene.db, scene.state)
-        scene.scheduler.look()
+        scene.scheduler.do_pass()
         assert "the service died while it ran" in scene.only["detail"]
     else:
         assert "nothing has moved" in scene.only["detail"]
@@ -252,7 +252,7 @@ def test_a_restart_before_what_only_computes_goes_on(scene: Scene, accepted: str
     index_run(scene.db, scene.state, accepted)
     scene.db.write("UPDATE reidentifications SET recorded = ?", accepted)
     scene.restart()
-    scene.scheduler.look()
+    scene.scheduler.do_pass()
     assert (scene.only["state"], scene.only["step"], scene.queued) == ("running", "identify", [("identify", False)])
     (row,) = jobs.queue(scene.db)
     # By the description that was accepted, and not by today's.
@@ -261,7 +261,7 @@ def test_a_restart_before_what_only_computes_goes_on(scene: Scene, accepted: str
     jobs.started(scene.db, row["id"], "")
     scene.restart()
     explain_interrupted(scene.db, scene.state)
-    scene.scheduler.look()
+    scene.scheduler.do_pass()
     assert scene.only["state"] == "interrupted"
     assert accepted in scene.only["detail"]
 
@@ -328,16 +328,16 @@ def test_a_notice_is_kept_with_the_record_of_its_delivery(scene: Scene) -> None:
     scene.scheduler._webhook = broken
     scene.at_six()
     with pytest.raises(sqlite3.OperationalError):
-        scene.scheduler.look()
+        scene.scheduler.do_pass()
     assert ([row["told"] for row in pending(scene.db)], deliveries(scene.db)) == ([0], [])
     broken.broken = False
     for _ in range(3):
-        scene.scheduler.look()
+        scene.scheduler.do_pass()
     assert ([row["told"] for row in pending(scene.db)], len(deliveries(scene.db))) == ([1], 1)
 
 
 def test_a_check_by_hand_is_untouched(scene: Scene) -> None:
     scene.at_six()
-    scene.scheduler.look()
+    scene.scheduler.do_pass()
     scene.engine.create(Check(kind="check", arm=ARM), "ann")
     assert scene.queued == [("check", False)]

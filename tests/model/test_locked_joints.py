@@ -256,7 +256,7 @@ def test_what_is_no_arm_is_refused(text: str, kinematics: dict[str, Any], words:
 def test_whoever_has_no_description_yet_is_told_how_one_locks_a_joint(tmp_path: Path) -> None:
     (tmp_path / "panda.urdf").write_text(PANDA)
     with pytest.raises(ModelError) as caught:
-        new_description(tmp_path / "panda.urdf", tmp_path / "arm.yaml", tip="panda_leftfinger")
+        new_description(tmp_path / "panda.urdf", tmp_path / "arm.yaml", tip_link="panda_leftfinger")
     said = str(caught.value)
     assert "lock 'panda_finger_joint1' in a description written by hand (`ident new` locks none), as" in said
     assert "with `ident new` --base and --tip, so that it is not between them" in said

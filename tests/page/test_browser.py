@@ -19,7 +19,7 @@ from page.conftest import Reached, log_in
 from playwright.sync_api import Browser, Page, expect
 
 from ident_service.motion.command_channel import in_use
-from ident_service.operations.moving_arms import held_arm
+from ident_service.operations.moving_arms import is_held
 from ident_service.registry import jobs as rows
 from ident_service.registry.arms import add_arm
 from ident_service.registry.database import audit_log
@@ -242,7 +242,7 @@ def test_support_is_confirmed_where_the_arm_waits_for_it(browser: Browser, reach
     assert not support.is_visible()
     page.keyboard.press("Escape")
     expect(support).to_be_visible()
-    assert held_arm(place, ARM)
+    assert is_held(place, ARM)
     for name in ("Pause", "Resume", "Finish now"):
         assert not page.get_by_role("button", name=name).is_visible()
     page.get_by_label(f"Type {ARM}").fill(ARM)

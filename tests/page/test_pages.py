@@ -23,7 +23,7 @@ from ident_service.cli import main
 from ident_service.daemon.app import PAGES
 from ident_service.daemon.jobs.requests import Base
 from ident_service.daemon.maintenance.reidentification import enter_concluded
-from ident_service.daemon.web.render import STATIC, mark, static
+from ident_service.daemon.web.render import STATIC, static_files, static_version
 from ident_service.daemon.web.run_pages import IdentifiedSet
 from ident_service.operations.drift_alarms import Verdict, alarms
 from ident_service.operations.maintenance_schedule import DueRule, add_event, add_schedule, events, pending, schedules
@@ -369,11 +369,11 @@ def test_two_runs_are_compared(daemon: Asked, commissioned: Path, tmp_path: Path
 
 
 def test_scripts_and_styles_are_ours_and_kept(daemon: Asked) -> None:
-    for name in static():
-        answer = daemon.get(f"/static/{mark()}/{name}")
-        assert (answer.status_code, answer.content) == (200, static()[name])
+    for name in static_files():
+        answer = daemon.get(f"/static/{static_version()}/{name}")
+        assert (answer.status_code, answer.content) == (200, static_files()[name])
         assert "immutable" in answer.headers["cache-control"]
-    for content in (static()[name] for name in STATIC):
+    for content in (static_files()[name] for name in STATIC):
         assert not re.search(rb"https?://(?!www\.w3\.org/2000/svg)", content)
         assert b"innerHTML" not in content
 

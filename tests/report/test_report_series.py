@@ -87,7 +87,7 @@ def test_segments_do_not_reach_across_a_gap() -> None:
     welch = Welch(1, RATE)
     welch.add(np.ones((1, welch.length - 1)))
     assert not welch.ready
-    welch.add(np.ones((1, welch.length - 1)), opens=True)
+    welch.add(np.ones((1, welch.length - 1)), after_gap=True)
     assert not welch.ready
     welch.add(np.ones((1, 1)))
     assert welch.ready

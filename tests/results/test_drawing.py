@@ -15,12 +15,12 @@ from ident_service.results.plots import (
     STEPS,
     Axes,
     Canvas,
-    number,
-    plain,
+    format_number,
     require_drawable,
     round_values,
-    style,
-    visible,
+    svg_style,
+    visible_samples,
+    xml_text,
 )
 
 
@@ -34,7 +34,7 @@ def test_thinning_keeps_every_column_s_extremes(steps: list[float], seed: int, c
     time = np.cumsum([0.0, *steps])
     # Few levels make many ties.
     values = np.random.default_rng(seed).integers(0, levels, len(time)).astype(float)
-    kept = visible(time, values, columns)
+    kept = visible_samples(time, values, columns)
     assert (np.diff(kept) > 0).all()
     assert kept[0] == 0
     assert kept[-1] == len(time) - 1
@@ -46,13 +46,13 @@ def test_thinning_keeps_every_column_s_extremes(steps: list[float], seed: int, c
 
 
 def test_thinning_leaves_few_samples_alone() -> None:
-    np.testing.assert_array_equal(visible(np.arange(20.0), np.zeros(20), 10), np.arange(20))
+    np.testing.assert_array_equal(visible_samples(np.arange(20.0), np.zeros(20), 10), np.arange(20))
 
 
 def test_one_sample_among_many_is_seen() -> None:
     time, values = np.linspace(0.0, 60.0, 60_001), np.zeros(60_001)
     values[12_345] = 1.0
-    kept = visible(time, values, 232)
+    kept = visible_samples(time, values, 232)
     assert 12_345 in kept
     assert len(kept) <= 2 * 232 + 2
 
@@ -68,7 +68,7 @@ def test_any_text_is_xml(text: str) -> None:
 
 
 def test_markup_in_names_is_only_text() -> None:
-    assert plain("<script a='1'>&\x00\ud800") == "&lt;script a=&#x27;1&#x27;&gt;&amp;\ufffd\ufffd"
+    assert xml_text("<script a='1'>&\x00\ud800") == "&lt;script a=&#x27;1&#x27;&gt;&amp;\ufffd\ufffd"
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_markup_in_names_is_only_text() -> None:
     ],
 )
 def test_numbers_for_people(value: float, text: str) -> None:
-    assert number(value) == text
+    assert format_number(value) == text
 
 
 @given(low=st.floats(-1e6, 1e6), span=st.floats(1e-3, 1e6), most=st.integers(1, 12))
@@ -123,7 +123,7 @@ def test_infinite_limits_can_be_drawn() -> None:
 
 
 def test_every_colour_has_its_dark_one() -> None:
-    light, dark = style().split("@media (prefers-color-scheme:dark)")
+    light, dark = svg_style().split("@media (prefers-color-scheme:dark)")
     coloured = set(re.findall(r"\.ident-figure \.(\w+)\{(?:fill|stroke):#", light))
     assert coloured == set(re.findall(r"\.ident-figure \.(\w+)\{", dark))
     assert {f"step{number}" for number in range(STEPS)} <= coloured
@@ -138,7 +138,7 @@ def _luminance(colour: str) -> float:
 
 @pytest.mark.parametrize("dark", [False, True])
 def test_contrast_is_enough_to_read(dark: bool) -> None:
-    sheet = style().split("@media (prefers-color-scheme:dark)")[dark]
+    sheet = svg_style().split("@media (prefers-color-scheme:dark)")[dark]
     colours = dict(re.findall(r"\.ident-figure \.(\w+)\{(?:fill|stroke):(#\w{6})", sheet))
 
     def contrast(kind: str) -> float:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ident_service.errors import UsageError
-from ident_service.results.manifest import atomic_folder, require_place, write_atomically
+from ident_service.results.manifest import atomic_folder, require_writable_place, write_atomically
 
 
 def everything_in(folder: Path) -> list[str]:
@@ -71,9 +71,9 @@ def test_a_missing_folder_is_a_usage_error(tmp_path: Path) -> None:
 
 def test_proc_alone_is_where_nothing_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(UsageError, match=r"^/proc/x: cannot be written: no permission in /proc$"):
-        require_place(Path("/proc/x"))
+        require_writable_place(Path("/proc/x"))
     monkeypatch.setattr(Path, "resolve", lambda _: Path("/processing"))
-    require_place(tmp_path)
+    require_writable_place(tmp_path)
 
 
 def test_a_folder_appears_at_the_end(tmp_path: Path) -> None:

@@ -118,7 +118,7 @@ def test_a_machine_that_stalls_in_virtual_time_loses_no_lease(virtual_arm: Path,
     motion = excitation(arm_model(config), "identification")
     ticket = read_ticket(ticket_path(state, config.name))
     # Every switch between two processes is longer than this lease.
-    ran = run_motion(config, motion, tmp_path / "run", state, ticket, lease=1e-3)
+    ran = run_motion(config, motion, tmp_path / "run", state, ticket, lease_seconds=1e-3)
     assert ran.report["state"] == "done"
 
 

@@ -36,7 +36,7 @@ class JobProcess(Protocol):
     def ended(self) -> bool:
         """Return whether the process has ended."""
 
-    def signal(self, number: int) -> None:
+    def signal(self, signal_number: int) -> None:
         """Send the process a signal, if it can be reached."""
 
     @property
@@ -88,10 +88,10 @@ class SubprocessJob:
         """Return whether the subprocess has ended."""
         return self._process.poll() is not None
 
-    def signal(self, number: int) -> None:
+    def signal(self, signal_number: int) -> None:
         """Send the subprocess a signal, if it still exists."""
         with suppress(ProcessLookupError):
-            self._process.send_signal(number)
+            self._process.send_signal(signal_number)
 
     @property
     def exit_code(self) -> int | None:
@@ -149,11 +149,11 @@ class UnitChild:
                 self._ended = True
         return self._ended
 
-    def signal(self, number: int) -> None:
+    def signal(self, signal_number: int) -> None:
         """Send the process a signal, if it lives and may be signalled."""
         if alive(self.process):
             with suppress(ProcessLookupError, PermissionError):
-                os.kill(int(self.process.split()[0]), number)
+                os.kill(int(self.process.split()[0]), signal_number)
 
     @property
     def exit_code(self) -> int | None:
@@ -186,9 +186,9 @@ def name_of(pid: int) -> str:
     return f"{pid} {began} {boot}"
 
 
-def alive(process: str) -> bool:
+def alive(process_name: str) -> bool:
     """Return whether the process with this name (`name_of`) exists and is no zombie."""
-    if not process or name_of(pid := int(process.split()[0])) != process:
+    if not process_name or name_of(pid := int(process_name.split()[0])) != process_name:
         return False
     try:
         status = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
@@ -197,8 +197,8 @@ def alive(process: str) -> bool:
     return status.rpartition(")")[2].split()[0] != "Z"
 
 
-def ask_to_end(process: str) -> None:
+def ask_to_end(process_name: str) -> None:
     """Send SIGTERM to the process of this name, if it lives and may be signalled."""
-    if alive(process):
+    if alive(process_name):
         with suppress(ProcessLookupError, PermissionError):
-            os.kill(int(process.split()[0]), signal.SIGTERM)
+            os.kill(int(process_name.split()[0]), signal.SIGTERM)

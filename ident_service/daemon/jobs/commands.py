@@ -87,7 +87,7 @@ class Command:
     waits: bool = True
 
 
-def command(db: Database, state: Path, request: asked.AnyJobRequest) -> Command:
+def command_of_request(db: Database, state: Path, request: asked.AnyJobRequest) -> Command:
     """Make the command that carries out a request: its arguments, arm, folder to make, and resources that it needs.
 
     Raises:
@@ -117,7 +117,7 @@ def command(db: Database, state: Path, request: asked.AnyJobRequest) -> Command:
     )
 
 
-def accepted_description(state: Path, arm: str, number: int) -> Path:
+def accepted_description(state: Path, arm: str, acceptance_number: int) -> Path:
     """Return the file of the arm description that an acceptance keeps, checked; raise UsageError if it names code.
 
     Raises:
@@ -125,7 +125,7 @@ def accepted_description(state: Path, arm: str, number: int) -> Path:
             cannot name any, but a folder that was imported can.
         ParameterError: what was accepted was changed on the disk.
     """
-    path = accepted_set(state, arm, number)[1] / ARM
+    path = accepted_set(state, arm, acceptance_number)[1] / ARM
     if (code := arm_from_json(path).constraints.custom) is not None:
         raise UsageError(
             f"what was accepted for {arm} was identified with code (constraints.custom: {code}), which a daemon does "
@@ -249,11 +249,11 @@ def _columns(db: Database, state: Path, references: Sequence[asked.RecordingRefe
     return [f"--columns={recording}={columns}" for recording, columns in files.items() if columns.is_file()]
 
 
-def range_words(one: asked.RecordingReference) -> str:
+def range_words(reference: asked.RecordingReference) -> str:
     """Format a recording's range as `@START:END` [s], an open side empty; an empty text for a whole recording."""
-    if one.start is None and one.end is None:
+    if reference.start is None and reference.end is None:
         return ""
-    return "@" + ":".join("" if seconds is None else f"{seconds:.9f}" for seconds in (one.start, one.end))
+    return "@" + ":".join("" if seconds is None else f"{seconds:.9f}" for seconds in (reference.start, reference.end))
 
 
 def _options(request: asked.AnyJobRequest, **others: str) -> list[str]:

@@ -20,7 +20,7 @@ from ident_service.errors import IdentError
 from ident_service.motion.command_channel import controlling_pid
 from ident_service.motion.ending import ENDED
 from ident_service.operations.drift_alarms import FLEET, raise_fleet_alarms
-from ident_service.operations.moving_arms import held_arm
+from ident_service.operations.moving_arms import is_held
 from ident_service.registry import jobs as rows
 from ident_service.registry.database import Database, Row, note
 from ident_service.registry.motions import MOTION_FILE, MOTIONS, index_motion
@@ -68,8 +68,8 @@ class ProcessOutput:
     text: str = ""
 
 
-def process_output(folder: Path, most: int = _LAST) -> ProcessOutput:
-    """Read the JSON answer of a job's process and the last `most` bytes of its log; empty where there is none."""
+def process_output(folder: Path, most_log_bytes: int = _LAST) -> ProcessOutput:
+    """Read the JSON answer of a job's process and the last `most_log_bytes` of its log; empty where there is none."""
     answer: dict[str, Any] = {}
     try:
         with (folder / ANSWER).open("rb") as stream:
@@ -80,8 +80,8 @@ def process_output(folder: Path, most: int = _LAST) -> ProcessOutput:
     try:
         with (folder / LOG).open("rb") as stream:
             end = stream.seek(0, 2)
-            stream.seek(max(end - most, 0))
-            log = stream.read(most).decode("utf-8", "replace")
+            stream.seek(max(end - most_log_bytes, 0))
+            log = stream.read(most_log_bytes).decode("utf-8", "replace")
     except OSError:
         log = ""
     # Not by `splitlines`, which takes the mark of samples for the end of a line.
@@ -89,20 +89,20 @@ def process_output(folder: Path, most: int = _LAST) -> ProcessOutput:
     return ProcessOutput(answer, "\n".join(lines), str(answer.pop("text", "")))
 
 
-def printed_samples(folder: Path, offset: int) -> tuple[list[dict[str, Any]], int]:
+def printed_samples(folder: Path, log_offset: int) -> tuple[list[dict[str, Any]], int]:
     """Return the samples that a job's process has printed since an offset in its log, and the offset to go on from.
 
     Each has `joints`, `time` [s] and `position` [rad or m] as the samples of a run have (`live.Thinned`).
     """
     try:
         with (folder / LOG).open("rb") as stream:
-            stream.seek(offset)
+            stream.seek(log_offset)
             piece = stream.read(_LAST)
     except OSError:
-        return [], offset
+        return [], log_offset
     whole = piece[: piece.rfind(b"\n") + 1]
     marked = (line for line in whole.decode("utf-8", "replace").split("\n") if line.startswith(rows.SAMPLES))
-    return [json.loads(line.removeprefix(rows.SAMPLES)) for line in marked], offset + len(whole)
+    return [json.loads(line.removeprefix(rows.SAMPLES)) for line in marked], log_offset + len(whole)
 
 
 def outcome(output: ProcessOutput, exit_code: int | None, end_reason: str) -> Outcome:
@@ -295,7 +295,7 @@ class Orphan:
             self.controlling_pid = has
         if not lives and (has is None or has != self.controlling_pid):
             return ""
-        if has is not None and held_arm(state, row["arm"]):
+        if has is not None and is_held(state, row["arm"]):
             return f" {has} holds {held_until(row['arm'])}"
         if time.monotonic() - self.since < _WAIT:
             return " is being looked for"
@@ -324,8 +324,8 @@ def orphans(db: Database, state: Path) -> list[Orphan]:
 def explain_interrupted(
     db: Database,
     state: Path,
-    found: Sequence[Orphan] | None = None,
-    over: Callable[[str], None] = lambda _: None,
+    waited_for: Sequence[Orphan] | None = None,
+    on_ended: Callable[[str], None] = lambda _: None,
     closing: threading.Event | None = None,
 ) -> None:
     """Wait until the previous service's processes have ended, SIGTERM sent unless they hold an arm; record each end.
@@ -335,16 +335,16 @@ def explain_interrupted(
     Args:
         db: the registry.
         state: the state folder.
-        found: them, as `orphans` returned them; looked for here if None.
-        over: called with the id of each job whose process has ended.
+        waited_for: the processes, as `orphans` returned them; looked for here if None.
+        on_ended: called with the id of each job whose process has ended.
         closing: event that ends this early; the next service goes on.
     """
-    left = list(orphans(db, state) if found is None else found)
+    left = list(orphans(db, state) if waited_for is None else waited_for)
     closing = threading.Event() if closing is None else closing
     recorded: dict[str, str] = {}
     for one in left:
         # A motion has seen the end of its input and stops its arm; a second word would end what holds it.
-        if not (one.row["motion"] and held_arm(state, one.row["arm"])):
+        if not (one.row["motion"] and is_held(state, one.row["arm"])):
             ask_to_end(one.process)
     while left and not closing.is_set():
         for one in tuple(left):
@@ -352,7 +352,7 @@ def explain_interrupted(
             if not words:
                 left.remove(one)
                 _explain(db, state, one.row)
-                over(job)
+                on_ended(job)
             elif words != recorded.setdefault(job, " is being looked for"):
                 recorded[job] = words
                 rows.explain(db, job, f"{END_UNOBSERVED}{words}")

@@ -31,7 +31,7 @@ from typing import Any, Final
 
 from ident_service.daemon.authentication import CHALLENGE_SECONDS
 from ident_service.daemon.jobs.child_process import RENEW, STOP, JobProcess, SubprocessJob, UnitChild
-from ident_service.daemon.jobs.commands import JOBS, READS_BUS, Command, command
+from ident_service.daemon.jobs.commands import JOBS, READS_BUS, Command, command_of_request
 from ident_service.daemon.jobs.outcome import (
     Orphan,
     explain_interrupted,
@@ -74,25 +74,29 @@ class Progress:
     remaining: float | None
 
 
-def progress(log: str, elapsed: float, typical: float | None) -> Progress:
+def progress(log_text: str, elapsed_seconds: float, usual_seconds: float | None) -> Progress:
     """Estimate a running job's phase (last log line), share done and time left, by its log or the usual duration.
 
     Args:
-        log: output of the job, its last lines at least.
-        elapsed: time since the job began [s].
-        typical: usual duration of such jobs [s]; None before there was one.
+        log_text: output of the job, its last lines at least.
+        elapsed_seconds: time since the job began [s].
+        usual_seconds: usual duration of such jobs [s]; None before there was one.
     """
-    said = (line.strip() for line in log.splitlines())
+    said = (line.strip() for line in log_text.splitlines())
     lines = [line for line in said if line and not line.startswith("next: ")]  # a hint at the end is no phase
     phase = lines[-1] if lines else "starting"
-    searches = _SEARCH.findall(log)
+    searches = _SEARCH.findall(log_text)
     if searches:
-        return _of(phase, elapsed, elapsed + float(searches[-1]))
-    motion = _MOTION.search(log)
-    if typical is None and motion is None:
+        return _of(phase, elapsed_seconds, elapsed_seconds + float(searches[-1]))
+    motion = _MOTION.search(log_text)
+    if usual_seconds is None and motion is None:
         return Progress(phase, None, None)
     # For a first run only the duration of its motion is known, not that of its approach and return.
-    return _of(phase, elapsed, typical if typical is not None else float(motion["seconds"]) if motion else 0.0)
+    return _of(
+        phase,
+        elapsed_seconds,
+        usual_seconds if usual_seconds is not None else float(motion["seconds"]) if motion else 0.0,
+    )
 
 
 def _of(phase: str, elapsed: float, whole: float) -> Progress:
@@ -183,12 +187,13 @@ class LiveJobs:
         """Return whether the thread that stops motions whose lease is not renewed is alive."""
         return self._thread.is_alive()
 
-    def add(self, live: LiveJob, stops: int | None = None) -> None:
+    def add(self, live: LiveJob, stops_at_begin: int | None = None) -> None:
         """Queue a job; raise MotionRefused while closing, after a later stop, or if it would have to wait and must not.
 
         Args:
             live: the job.
-            stops: result of `stops` when the sequence began of which this job is a step; None for a single job.
+            stops_at_begin: result of `stops` when the sequence began of which this job is a step; None for a single
+                job.
 
         Raises:
             MotionRefused: nothing is begun any more; somebody has asked for a stop meanwhile; or it may not wait, and
@@ -197,7 +202,7 @@ class LiveJobs:
         with self._lock:
             if self._closing:
                 raise MotionRefused("the service is shutting down and starts no jobs")
-            if stops is not None and stops != self.stops(live.order.arm):
+            if stops_at_begin is not None and stops_at_begin != self.stops(live.order.arm):
                 raise MotionRefused("a stop was requested meanwhile; no job is started")
             before = self._before(live)
             if before and not live.order.waits:
@@ -212,7 +217,7 @@ class LiveJobs:
             live.renewed, live.entered = self._now(), True
         self.changed.set()
 
-    def keep_from(self, orphans: Mapping[str, frozenset[str]]) -> None:
+    def reserve_for_orphans(self, orphans: Mapping[str, frozenset[str]]) -> None:
         """Set the resources, by job, that processes of the previous service still use; no job that needs one begins."""
         with self._lock:
             self._orphans = dict(orphans)
@@ -265,20 +270,20 @@ class LiveJobs:
         """Return whether a job has not ended yet."""
         return live.job in self._jobs
 
-    def free(self, live: LiveJob, computing: int) -> bool:
-        """Return whether a job may begin: no earlier one uses its resources; without any, fewer than `computing` run.
+    def may_begin(self, live: LiveJob, most_computing: int) -> bool:
+        """Return whether a job may begin: its resources are free; if it needs none, fewer than `most_computing` run.
 
         Args:
             live: the job.
-            computing: how many jobs compute at a time.
+            most_computing: how many jobs compute at a time.
         """
         with self._lock:
             if not live.order.resources:
                 running = [one for one in self._jobs.values() if one.child is not None and not one.order.resources]
-                return len(running) < computing
+                return len(running) < most_computing
             return not self._before(live)
 
-    def began(self, live: LiveJob, child: JobProcess) -> None:
+    def store_process(self, live: LiveJob, child: JobProcess) -> None:
         """Store the process of a job; pass on a stop that was asked for while it was being started."""
         with self._lock:
             live.child = child
@@ -320,33 +325,33 @@ class LiveJobs:
         self._renewed(age)
         return lease
 
-    def stop(self, arm: str | None, why: str) -> list[str]:
+    def stop(self, arm: str | None, reason: str) -> list[str]:
         """Ask the motions of an arm, or all if None, to stop, or not to begin; return their ids at once."""
         with self._lock:
             self._stops[arm] += 1
             found = [one for one in self._jobs.values() if one.order.moves and arm in (None, one.order.arm)]
             for live in found:
-                self._end(live, why)
+                self._end(live, reason)
         return [live.job for live in found]
 
     def stops(self, arm: str | None) -> int:
         """Return the number of stops asked for so far that concern an arm: those of all arms plus its own."""
         return self._stops[None] + (self._stops[arm] if arm is not None else 0)
 
-    def end(self, job: str, why: str) -> bool:
+    def end(self, job: str, reason: str) -> bool:
         """Ask one job to end, a motion by a controlled stop; return whether the job is live."""
         with self._lock:
             live = self._jobs.get(job)
             if live is not None:
-                self._end(live, why)
+                self._end(live, reason)
         return live is not None
 
-    def end_all(self, why: str) -> None:
+    def end_all(self, reason: str) -> None:
         """Ask all jobs to end, and accept no more."""
         with self._lock:
             self._closing = True
             for live in self._jobs.values():
-                self._end(live, why)
+                self._end(live, reason)
 
     def _end(self, live: LiveJob, why: str, state: str = "cancelled") -> None:
         """Ask a job to end, in a state if it has not begun; the first reason counts."""
@@ -424,7 +429,7 @@ class Engine:
         """
         self.metrics = Metrics() if metrics is None else metrics
         self.db, self.state, self.audit = db, state, AuditQueue(db)
-        self.live = LiveJobs(lease_factor, now, self.metrics.renewed)
+        self.live = LiveJobs(lease_factor, now, self.metrics.record_lease_age)
         self._computing, self._motion_socket, self._now = computing, motion_socket, now
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._work, name="jobs", daemon=True)
@@ -434,16 +439,16 @@ class Engine:
         self._first: Callable[[], Any] = lambda: None
         self.beat = now()
 
-    def start(self, first: Callable[[], Any] = lambda: None) -> None:
+    def start(self, before_queue: Callable[[], Any] = lambda: None) -> None:
         """Mark interrupted jobs, requeue waiting computations, then begin to run the queue; returns at once.
 
         Args:
-            first: function that the queue's thread calls before it begins anything.
+            before_queue: function that the queue's thread calls before it begins anything.
         """
-        self._first = first
+        self._first = before_queue
         mark_interrupted(self.db, self.state)
         self._orphans = orphans(self.db, self.state)
-        self.live.keep_from({one.row["id"]: self._resources(one.row) for one in self._orphans})
+        self.live.reserve_for_orphans({one.row["id"]: self._resources(one.row) for one in self._orphans})
         self._requeue()
         self._following.start()
         self._thread.start()
@@ -462,22 +467,22 @@ class Engine:
 
     def create(
         self,
-        asked: AnyJobRequest,
+        request: AnyJobRequest,
         by: str,
         *,
         own_lease: bool = False,
-        stops: int | None = None,
-        entering: Callable[[Row], None] = lambda _: None,
+        stops_at_begin: int | None = None,
+        also_write: Callable[[Row], None] = lambda _: None,
     ) -> Row:
         """Queue a job and return its row of the registry.
 
         Args:
-            asked: request of the job, its objects named by id.
+            request: request of the job, its objects named by id.
             by: the name of a token, or `service`.
             own_lease: whether a motion's lease is the service's own, as a scheduled one's is.
-            stops: value of `live.stops` when a person, or the schedule, began the work of which this job is a later
-                step.
-            entering: function that writes what belongs to the job, in the same transaction.
+            stops_at_begin: value of `live.stops` when a person, or the schedule, began the work of which this job is
+                a later step.
+            also_write: function that writes what belongs to the job, in the same transaction.
 
         Raises:
             UsageError: it names what is not known.
@@ -485,21 +490,21 @@ class Engine:
             MotionRefused: the service is ending, or somebody has asked for a stop meanwhile; or it may not wait, and
                 would have to.
         """
-        order = command(self.db, self.state, asked)
-        job = new_id(asked.kind)
+        order = command_of_request(self.db, self.state, request)
+        job = new_id(request.kind)
         now = self._now()
         live = LiveJob(job, order, by, own_lease, now, time.monotonic_ns(), now)
-        self.live.add(live, stops)
+        self.live.add(live, stops_at_begin)
         try:
             (self.state / JOBS / job).mkdir(parents=True)
             with self.db.transaction():
                 row = rows.add_job(
-                    *(self.db, job, asked.kind, order.arm, asked.model_dump(mode="json"), list(order.words), by),
+                    *(self.db, job, request.kind, order.arm, request.model_dump(mode="json"), list(order.words), by),
                     motion=order.moves,
                     run=order.run,
                 )
-                note(self.db, by, "job created", job, kind=asked.kind, arm=order.arm)
-                entering(row)
+                note(self.db, by, "job created", job, kind=request.kind, arm=order.arm)
+                also_write(row)
         except BaseException:
             self.live.remove(live)
             with suppress(OSError):
@@ -531,10 +536,10 @@ class Engine:
             self.audit.note(by, "stop", arm or "all arms", reached=reached, jobs=ended)
         return {"arms": reached, "jobs": ended}
 
-    def ask(self, arm: str, asked: Asked, by: str) -> bool:
+    def ask(self, arm: str, request: Asked, by: str) -> bool:
         """Send `pause`, `resume` or such to the process that moves or holds an arm; return whether there was one."""
-        reached = ask_arm(self.state, arm, asked)
-        self.audit.note(by, asked, arm, reached=[arm] if reached else [])
+        reached = ask_arm(self.state, arm, request)
+        self.audit.note(by, request, arm, reached=[arm] if reached else [])
         return reached
 
     def progress(self, row: Row) -> Progress | None:
@@ -635,7 +640,7 @@ class Engine:
         """Handle a queued job: end it if asked to, begin it if it is its turn."""
         if live.end_reason:
             self._finish(live, live.end_state, live.end_reason, None)
-        elif self.live.free(live, self._computing):
+        elif self.live.may_begin(live, self._computing):
             self._begin(live)
 
     def _begin(self, live: LiveJob) -> None:
@@ -656,7 +661,7 @@ class Engine:
         except (IdentError, OSError) as error:
             self._finish(live, "failed", f"its process could not be started: {error}", None)
             return
-        self.live.began(live, child)
+        self.live.store_process(live, child)
         self.db.write("UPDATE jobs SET process = ? WHERE id = ?", child.process, live.job)
         LOG.info("job started", extra={"job": live.job, "arm": live.order.arm})
 
@@ -731,9 +736,9 @@ class Engine:
         row = rows.known_job(self.db, job)
         began, ended = row["started"] or row["ended"], row["ended"]
         ran = max(ended - began, 0.0) if row["started"] else None
-        self.metrics.job(row["kind"], row["state"], max(began - row["created"], 0.0), ran)
+        self.metrics.record_job(row["kind"], row["state"], max(began - row["created"], 0.0), ran)
         if row["motion"] and row["run"] is not None:
-            self.metrics.lateness(lateness_of(self.state / RUNS / row["run"]))
+            self.metrics.add_lateness(lateness_of(self.state / RUNS / row["run"]))
 
     def _requeue(self) -> None:
         """Queue computations again that waited when the service ended, in their old order."""
@@ -742,7 +747,7 @@ class Engine:
         reader: TypeAdapter[AnyJobRequest] = TypeAdapter(AnyJobRequest)
         for row in rows.queue(self.db):
             try:
-                order = command(self.db, self.state, reader.validate_python(row["request"]))
+                order = command_of_request(self.db, self.state, reader.validate_python(row["request"]))
             except (IdentError, ValueError) as error:
                 rows.ended(self.db, row["id"], "failed", f"it cannot be begun any more: {error}")
                 forget_unmade(self.db, self.state, row)

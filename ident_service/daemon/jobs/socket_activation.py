@@ -33,7 +33,7 @@ def main() -> int:
         words, folder = [str(word) for word in request["words"]], Path(request["folder"])
     except (ValueError, KeyError, TypeError):
         return refuse("not a request")
-    if not taken(words):
+    if not is_allowed(words):
         return refuse("only motions under a lease, and read-only commands, are accepted here")
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
     try:
@@ -47,19 +47,19 @@ def main() -> int:
     return os.execv(sys.executable, [sys.executable, "-P", "-m", "ident_service", *words])  # noqa: S606 - our own interpreter
 
 
-def taken(words: list[str]) -> bool:
+def is_allowed(arguments: list[str]) -> bool:
     """Return whether the arguments are a motion under a lease, or a read-only command with known options."""
-    if words and words[0] in _VERBS and "--lease-from-stdin" in words:
+    if arguments and arguments[0] in _VERBS and "--lease-from-stdin" in arguments:
         return True
     # A list of allowed options: argparse accepts a prefix of an option, such as `--leave`, for the whole.
-    options = [word for word in words if word.startswith("-")]
+    options = [word for word in arguments if word.startswith("-")]
     good = all(word.startswith("--seconds=") or word in _OPTIONS_OF_LOOKS for word in options)
-    return good and any(tuple(words[: len(look)]) == look for look in _LOOKS)
+    return good and any(tuple(arguments[: len(look)]) == look for look in _LOOKS)
 
 
-def refuse(why: str) -> int:
+def refuse(reason: str) -> int:
     """Print the reason on stderr, which goes to the journal, and return exit code 2."""
-    os.write(2, f"ident: {why}\n".encode())
+    os.write(2, f"ident: {reason}\n".encode())
     return 2
 
 

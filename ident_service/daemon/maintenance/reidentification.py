@@ -58,17 +58,17 @@ def require_comparable(state: Path, config: ArmConfig) -> int:
     return act.number
 
 
-def known_reidentification(db: Database, name: str) -> Row:
+def known_reidentification(db: Database, reidentification_id: str) -> Row:
     """Return the row of the re-identification of this id; raise UnknownId where there is none.
 
     Raises:
         UnknownId: there is none.
     """
-    return db.known("reidentifications", "re-identification", name)
+    return db.known("reidentifications", "re-identification", reidentification_id)
 
 
 def reidentifications(db: Database, arm: str | None = None, *, before: str | None = None, most: int = 100) -> list[Row]:
-    """Return re-identifications, or those of an arm, the newest first, from the one after the id `before`.
+    """Return at most `most` re-identifications, of an arm if given, the newest first, older than the id `before`.
 
     Raises:
         UnknownId: there is none of that id.
@@ -95,16 +95,24 @@ def conclude(db: Database, row: Row, verdict: Verdict, now: float) -> None:
 
 
 def enter_concluded(
-    db: Database, arm: str, against: int, recorded: str, run: str, verdict: Verdict, begun: float, by: str, now: float
+    db: Database,
+    arm: str,
+    acceptance_number: int,
+    recorded_run: str,
+    identified_run: str,
+    verdict: Verdict,
+    begun: float,
+    by: str,
+    now: float,
 ) -> str:
     """Enter a re-identification done at a terminal and conclude it by its verdict (`conclude`); return its new id.
 
     Args:
         db: the registry.
         arm: name.
-        against: number of the acceptance.
-        recorded: id of the run with the recording.
-        run: id of the run with the parameters.
+        acceptance_number: number of the acceptance.
+        recorded_run: id of the run with the recording.
+        identified_run: id of the run with the parameters.
         verdict: verdict of the comparison.
         begun: s since 1970 in UTC.
         by: name of the person who did it.
@@ -115,7 +123,7 @@ def enter_concluded(
         db.write(
             "INSERT INTO reidentifications (id, arm, step, state, against, unattended, recorded, run, begun, begun_by) "
             "VALUES (?, ?, 'judge', 'interrupted', ?, 0, ?, ?, ?, ?)",
-            *(name, arm, against, recorded, run, begun, by),
+            *(name, arm, acceptance_number, recorded_run, identified_run, begun, by),
         )
         # `conclude` ends running ones only; nobody sees this state outside of the transaction.
         db.write("UPDATE reidentifications SET state = 'running' WHERE id = ?", name)
@@ -153,15 +161,15 @@ class Reidentifications:
         self._steps: dict[str, tuple[str, str]] = {}
         self._lock = threading.Lock()
 
-    def step(self, name: str) -> tuple[str, str] | None:
+    def present_step(self, reidentification_id: str) -> tuple[str, str] | None:
         """Return (who began a running re-identification, id of its present job); None if not of this process."""
-        return self._steps.get(name)
+        return self._steps.get(reidentification_id)
 
-    def begin(self, wanted: ReidentificationRequest, by: str) -> Row:
+    def begin(self, request: ReidentificationRequest, by: str) -> Row:
         """Begin a re-identification by queuing its first step, the preflight; return its row of the registry.
 
         Args:
-            wanted: the request.
+            request: the request.
             by: the name of a token, or `service`; it keeps the lease of the motions, unless unattended.
 
         Raises:
@@ -169,28 +177,28 @@ class Reidentifications:
             ConfigError: the arm's description has mistakes.
             MotionRefused: unattended, and the description does not allow it; or the arm is being re-identified already.
         """
-        config = known_arm(self._db, self._state, wanted.arm).config
-        if wanted.unattended:
+        config = known_arm(self._db, self._state, request.arm).config
+        if request.unattended:
             _require_allowed(config)
         against = require_comparable(self._state, config)
         accepted_description(self._state, config.name, against)  # checked here, before anything moves
-        name, stops = new_id(wanted.arm), self._engine.live.stops(wanted.arm)
+        name, stops = new_id(request.arm), self._engine.live.stops(request.arm)
 
         def enter(job: Row) -> None:
             try:
                 self._db.write(
                     "INSERT INTO reidentifications (id, arm, step, state, motion, against, unattended, job, begun, "
                     "begun_by) VALUES (?, ?, 'check', 'running', ?, ?, ?, ?, ?, ?)",
-                    *(name, wanted.arm, wanted.motion, against, int(wanted.unattended), job["id"], self._now(), by),
+                    *(name, request.arm, request.motion, against, int(request.unattended), job["id"], self._now(), by),
                 )
             except sqlite3.IntegrityError:
-                raise MotionRefused(f"{wanted.arm}: is being re-identified already") from None
-            note(self._db, by, "re-identification begun", wanted.arm, id=name, unattended=wanted.unattended)
+                raise MotionRefused(f"{request.arm}: is being re-identified already") from None
+            note(self._db, by, "re-identification begun", request.arm, id=name, unattended=request.unattended)
             self._steps[name] = by, job["id"]
 
         with self._lock:
-            check = Check(kind="check", arm=wanted.arm, motion=wanted.motion)
-            self._engine.create(check, by, own_lease=wanted.unattended, stops=stops, entering=enter)
+            check = Check(kind="check", arm=request.arm, motion=request.motion)
+            self._engine.create(check, by, own_lease=request.unattended, stops_at_begin=stops, also_write=enter)
             self._stops[name] = stops
         return known_reidentification(self._db, name)
 
@@ -249,7 +257,7 @@ class Reidentifications:
 
         stops = self._stops.get(row["id"]) if step == "check" else None
         own = bool(row["unattended"])
-        self._engine.create(asked, row["begun_by"], own_lease=own, stops=stops, entering=enter)
+        self._engine.create(asked, row["begun_by"], own_lease=own, stops_at_begin=stops, also_write=enter)
 
     def _ended(self, row: Row, state: str, detail: str) -> None:
         for column in ("recorded", "run"):

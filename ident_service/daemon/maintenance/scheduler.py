@@ -66,7 +66,7 @@ class MaintenanceScheduler:
         if self._webhook is not None:
             self._webhook.close()
 
-    def look(self) -> None:
+    def do_pass(self) -> None:
         """Do one pass: mark what is due, advance re-identifications, begin those allowed (arms move), send notices."""
         now = self._now()
         mark_due(self._db, now)
@@ -80,7 +80,7 @@ class MaintenanceScheduler:
     def _work(self) -> None:
         while not self._ending.is_set():
             try:
-                self.look()
+                self.do_pass()
             except sqlite3.Error as error:  # a full disk, say
                 LOG.error("what is due waits for the registry: %s", error)
             except Exception:  # the next pass may succeed

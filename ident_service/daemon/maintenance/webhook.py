@@ -77,20 +77,20 @@ class Webhook:
         self._thread = threading.Thread(target=self._work, name="webhook", daemon=True)
         self._thread.start()
 
-    def send(self, kind: str, at: float, data: Mapping[str, Any]) -> str:
+    def send(self, kind: str, event_time: float, event_data: Mapping[str, Any]) -> str:
         """Write a notice into the registry, from where a thread sends it later, and return the notice's id.
 
         Args:
             kind: `arm.due` and so on.
-            at: time of the event [s since 1970 in UTC].
-            data: JSON values.
+            event_time: time of the event [s since 1970 in UTC].
+            event_data: JSON values.
         """
-        when = datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-        body = json.dumps({"type": kind, "timestamp": when, "data": dict(data)}, allow_nan=False)
+        when = datetime.fromtimestamp(event_time, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        body = json.dumps({"type": kind, "timestamp": when, "data": dict(event_data)}, allow_nan=False)
         name = f"msg_{secrets.token_hex(12)}"
         self._db.write(
             "INSERT INTO deliveries (id, arm, body, created, next) VALUES (?, ?, ?, ?, ?)",
-            *(name, str(data.get("arm", "")), body, self._now(), self._now()),
+            *(name, str(event_data.get("arm", "")), body, self._now(), self._now()),
         )
         return name
 
@@ -163,7 +163,7 @@ class Webhook:
 
 
 def deliveries(db: Database, *, before: int | None = None, most: int = 100) -> list[Row]:
-    """Return notices with their results, the newest first, from the one before the number `before`."""
+    """Return at most `most` notices with their results, the newest first, only those numbered below `before`."""
     return db.rows(
         "SELECT * FROM deliveries WHERE number < ? ORDER BY number DESC LIMIT ?",
         *(2**62 if before is None else before, most),

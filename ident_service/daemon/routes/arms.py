@@ -140,7 +140,7 @@ def add_arm(service: Serving, who: Operator, body: NewArm) -> answers.AddedArmAn
     """
     text, files = body.description, body.files
     judged: dict[str, Any] = {}
-    with service.checks.place(), TemporaryDirectory(prefix="ident-meshes-") as place:
+    with service.checks.slot(), TemporaryDirectory(prefix="ident-meshes-") as place:
         write_files(Path(place), body.meshes)
         added = known.add_arm(
             *(service.db, service.state, text, files, who.name),
@@ -151,7 +151,7 @@ def add_arm(service: Serving, who: Operator, body: NewArm) -> answers.AddedArmAn
     return answers.AddedArmAnswer(**_arm(service, added.name).model_dump(), objections=judged.get("objections"))
 
 
-def write_files(place: Path, files: dict[str, str]) -> None:
+def write_files(folder: Path, files: dict[str, str]) -> None:
     """Write files, given as name to base 64 text, into a folder.
 
     Raises:
@@ -159,7 +159,7 @@ def write_files(place: Path, files: dict[str, str]) -> None:
     """
     for name, content in files.items():
         try:
-            (place / name).write_bytes(b64decode(content, validate=True))
+            (folder / name).write_bytes(b64decode(content, validate=True))
         except ValueError:
             raise UsageError(f"{name!r}: its content is not base 64") from None
 
@@ -297,7 +297,7 @@ def describe(service: Serving, _: Operator, body: NewDescription) -> NewDescript
     """Return a first description of an arm, written from its URDF and meshes; nothing is kept."""
     if body.urdf not in body.files:
         raise UsageError(f"{body.urdf!r} is not among the files; send the URDF with its meshes")
-    with service.checks.place(), TemporaryDirectory(prefix="ident-new-") as place:
+    with service.checks.slot(), TemporaryDirectory(prefix="ident-new-") as place:
         write_files(Path(place), body.files)
         return NewDescriptionAnswer(**describe_apart(Path(place) / body.urdf, body.name))
 
@@ -305,7 +305,7 @@ def describe(service: Serving, _: Operator, body: NewDescription) -> NewDescript
 @router.post("/descriptions/check")
 def check(service: Serving, _: Operator, body: Description) -> DescriptionAnswer:
     """Check a description without keeping it; its mistakes are answered with line and column."""
-    with service.checks.place(), known.uploaded(service.state, body.description, body.files) as path:
+    with service.checks.slot(), known.uploaded(service.state, body.description, body.files) as path:
         load_arm(path, upload=True)  # finds most mistakes, without a process
         return DescriptionAnswer(**judge_apart(path))
 

@@ -19,7 +19,7 @@ class Checks:
         self._places = threading.BoundedSemaphore(MOST_CHECKS)
 
     @contextmanager
-    def place(self) -> Iterator[None]:
+    def slot(self) -> Iterator[None]:
         """Take one of `MOST_CHECKS` slots during the block; raise HTTPException 503 at once where none is free.
 
         Raises:

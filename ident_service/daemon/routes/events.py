@@ -89,7 +89,7 @@ async def _events(
     silent, recorded = 0.0, _Recorded(service, live)
     while not service.engine.closing:
         if watch.due:
-            await run_in_threadpool(watch.look)
+            await run_in_threadpool(watch.poll)
         while watch.behind(seen):
             for one in await run_in_threadpool(watch.earlier, seen):
                 yield _event(one)

@@ -24,7 +24,7 @@ from ident_service.daemon.jobs.commands import JOBS
 from ident_service.daemon.jobs.outcome import held_until, is_end_unobserved, process_output
 from ident_service.daemon.jobs.requests import MOVES, AnyJobRequest, ArmName, Id, RequestBody
 from ident_service.errors import MotionRefused, UnknownId, UsageError
-from ident_service.operations.moving_arms import held_arm
+from ident_service.operations.moving_arms import is_held
 from ident_service.registry import jobs as rows
 from ident_service.registry.arms import arm_names
 from ident_service.registry.database import Row
@@ -112,7 +112,7 @@ def create_job(
             rows.enter_key(service.db, who.name, idempotency_key, asked, job["id"])
 
         try:
-            return job_answer_document(service, service.engine.create(body.job, who.name, entering=enter))
+            return job_answer_document(service, service.engine.create(body.job, who.name, also_write=enter))
         except sqlite3.IntegrityError:  # the same request came twice at once, and the other one was entered first
             row = rows.job_of_key(service.db, who.name, idempotency_key, asked)
             if row is None:
@@ -240,13 +240,13 @@ def job_answer_document(service: Service, row: Row) -> answers.JobAnswer:
     shown["detail"] = _named(row["detail"], service, row)
     progress = None if found is None else _named(asdict(found), service, row)
     moves = bool(row["motion"]) and (row["state"] == "running" or is_end_unobserved(row))
-    held = moves and held_arm(service.state, str(row["arm"]))
+    held = moves and is_held(service.state, str(row["arm"]))
     if held and progress is not None:  # it ends when a person says so
         progress |= {"fraction": None, "remaining": None}
     if row["state"] == "queued" and (before := service.engine.live.waits_for(row["id"])) is not None:
         other = service.db.row("SELECT arm FROM jobs WHERE id = ? AND motion", before)
         shown["detail"] = f"waits for {before}"
-        if other is not None and held_arm(service.state, str(other["arm"])):
+        if other is not None and is_held(service.state, str(other["arm"])):
             shown["detail"] += f", which holds {held_until(other['arm'])}"
     unentered, code = service.engine.live.unentered(row["id"]) if row["state"] == "running" else ("", None)
     if unentered:
@@ -260,22 +260,22 @@ def _named(value: Any, service: Service, row: Row) -> Any:
     return without_paths(value, str(service.state), described if row["arm"] is not None else {})
 
 
-def without_paths(value: Any, state: str, named: Mapping[str, str] = NOTHING) -> Any:
-    """Make paths in all texts of JSON values relative to the state folder; replace those in `named` by their names.
+def without_paths(value: Any, state_folder: str, names_by_path: Mapping[str, str] = NOTHING) -> Any:
+    """Make paths in all texts of JSON values relative to the state folder; replace those in `names_by_path`.
 
     Args:
         value: JSON values.
-        state: the folder.
-        named: texts that replace other paths, by path.
+        state_folder: the folder.
+        names_by_path: texts that replace other paths, by path.
     """
     if isinstance(value, str):
-        for place, name in named.items():
+        for place, name in names_by_path.items():
             value = value.replace(place, name)
-        return value.replace(f" --state {state}", "").replace(f"{state}/", "")
+        return value.replace(f" --state {state_folder}", "").replace(f"{state_folder}/", "")
     if isinstance(value, list):
-        return [without_paths(part, state, named) for part in value]
+        return [without_paths(part, state_folder, names_by_path) for part in value]
     if isinstance(value, dict):
-        return {key: without_paths(part, state, named) for key, part in value.items()}
+        return {key: without_paths(part, state_folder, names_by_path) for key, part in value.items()}
     return value
 
 

@@ -150,7 +150,7 @@ def _home_svg(path: Path, changed: int) -> str:
 
 
 def motion_svg(service: Service, arm: str, motion: str) -> str:
-    """Return the picture of an arm along a motion, the description's own if its id is empty, as an SVG."""
+    """Return an SVG of an arm along the motion of this id, or along its description's own if the id is empty."""
     from ident_service.operations.arm_pictures import motion_picture
 
     return motion_picture(*_motion(service, arm, motion))

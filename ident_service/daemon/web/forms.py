@@ -88,7 +88,7 @@ def see_other(address: str) -> RedirectResponse:
     return RedirectResponse(address, 303)
 
 
-def inside(address: str) -> str:
+def local_path(address: str) -> str:
     """Return the address if it is a path on this service, else `/`."""
     good = address.startswith("/") and not address.startswith("//") and "\\" not in address and address.isprintable()
     return address if good else "/"

@@ -103,26 +103,26 @@ def steps(db: Database, row: Row) -> tuple[Step, ...]:
     )
 
 
-def compared(db: Database, state: Path, run: str | None, words: str) -> Compared | None:
+def compared(db: Database, state: Path, run_id: str | None, verdict_words: str) -> Compared | None:
     """Return a run's stored comparison if its verdict has these words; None if missing, changed or replaced since.
 
     Args:
         db: the registry.
         state: the state folder.
-        run: id of the run with the parameters.
-        words: words of the conclusion, as the registry has them.
+        run_id: id of the run with the parameters.
+        verdict_words: words of the conclusion, as the registry has them.
     """
     try:
-        named = {} if run is None else runs.run_files(db, state, run)
-        if run is None or not {DOCUMENT, PAGE} <= set(named):
+        named = {} if run_id is None else runs.run_files(db, state, run_id)
+        if run_id is None or not {DOCUMENT, PAGE} <= set(named):
             return None
-        folder = runs.run_folder(db, state, run)
+        folder = runs.run_folder(db, state, run_id)
         if (folder / DOCUMENT).stat().st_size > _MOST_BYTES:
             return None
         if any(file_sha256(folder / name) != named[name] for name in (DOCUMENT, PAGE)):
             return None
         document = json.loads((folder / DOCUMENT).read_bytes())
-        return _comparison(folder, document["compared"][0]) if verdict_of(document).words == words else None
+        return _comparison(folder, document["compared"][0]) if verdict_of(document).words == verdict_words else None
     except (IdentError, OSError, ValueError, LookupError, TypeError):
         return None
 

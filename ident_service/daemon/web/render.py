@@ -21,7 +21,7 @@ from markupsafe import Markup
 
 from ident_service import __version__
 from ident_service.registry.tokens import Access
-from ident_service.results.plots import number
+from ident_service.results.plots import format_number
 
 _SCRIPTS: Final = ("page", "plots", "live", "again", "upload", "news", "series", "table", "trends", "new", "viewer")
 STATIC: Final = {
@@ -52,16 +52,20 @@ _VIEWER_POLICY: Final = (
 )
 
 
-def page(name: str, who: Access | None, status: int = 200, **values: Any) -> HTMLResponse:
+def page(template_name: str, who: Access | None, status: int = 200, **values: Any) -> HTMLResponse:
     """Render a template as a page.
 
     Args:
-        name: of the template, without its ending.
+        template_name: of the template, without its ending.
         who: the caller; None for one that is not logged in.
         status: of the answer.
         values: of the template; every one that it names must be there.
     """
-    text = _environment().get_template(f"{name}.html").render(who=who, version=__version__, mark=mark(), **values)
+    text = (
+        _environment()
+        .get_template(f"{template_name}.html")
+        .render(who=who, version=__version__, mark=static_version(), **values)
+    )
     return HTMLResponse(text, status, headers=_HEADERS)
 
 
@@ -76,7 +80,7 @@ def picture(svg: str) -> Response:
 
 def viewer_page() -> HTMLResponse:
     """Return the page with the vendored viewer of the API's description; nothing is loaded from elsewhere."""
-    text = _environment().get_template("api.html").render(mark=mark(), viewer=viewer_version())
+    text = _environment().get_template("api.html").render(mark=static_version(), viewer=viewer_version())
     return HTMLResponse(text, headers={**_HEADERS, "Content-Security-Policy": _VIEWER_POLICY})
 
 
@@ -97,7 +101,7 @@ def _vendored() -> Traversable:
 
 
 @lru_cache(maxsize=1)
-def static() -> dict[str, bytes]:
+def static_files() -> dict[str, bytes]:
     """Return the static files of pages, name to content."""
     own, others = files(__package__).joinpath("static"), _vendored()
     return {
@@ -107,9 +111,9 @@ def static() -> dict[str, bytes]:
 
 
 @lru_cache(maxsize=1)
-def mark() -> str:
+def static_version() -> str:
     """Return 12 digits of the hash of all static files, a part of their addresses, so that browsers can keep them."""
-    return hashlib.sha256(b"".join(static().values())).hexdigest()[:12]
+    return hashlib.sha256(b"".join(static_files().values())).hexdigest()[:12]
 
 
 @lru_cache(maxsize=1)
@@ -151,7 +155,7 @@ def _figure(value: float | None, digits: int = 3) -> str:
     """Format a number for people, as the report does."""
     if value is None or not math.isfinite(value):
         return "\u2014"
-    return number(value, digits)
+    return format_number(value, digits)
 
 
 def _share(value: float | None, limit: float | None) -> str:

@@ -10,14 +10,14 @@ from fastapi import APIRouter, HTTPException, Query, Request, Response
 from ident_service.daemon.dependencies import Cookie, Near, Serving
 from ident_service.daemon.routes import about
 from ident_service.daemon.routes.jobs import stop_all
-from ident_service.daemon.web.forms import Form, PageRoute, inside, see_other
+from ident_service.daemon.web.forms import Form, PageRoute, local_path, see_other
 from ident_service.daemon.web.render import (
     STATIC,
     VENDORED,
     VIEWER,
-    mark,
     page,
-    static,
+    static_files,
+    static_version,
     viewer_file,
     viewer_page,
     viewer_version,
@@ -31,13 +31,13 @@ Next = Annotated[str, Query(alias="next", max_length=500)]
 @router.get("/login")
 def show_login(where: Next = "/") -> Response:
     """Show the form that asks for a token."""
-    return page("login", None, where=inside(where), problem="")
+    return page("login", None, where=local_path(where), problem="")
 
 
 @router.post("/login")
 def log_in(service: Serving, request: Request, form: Form) -> Response:
     """Exchange the form's token for a session and go to the page asked for, or show the form again."""
-    where, answer = inside(form.get("next", "/")), see_other(inside(form.get("next", "/")))
+    where, answer = local_path(form.get("next", "/")), see_other(local_path(form.get("next", "/")))
     try:
         about.login(service, request, answer, about.Login(token=form.get("token", "").strip()[:200] or "none"))
     except HTTPException as error:
@@ -62,20 +62,20 @@ def show_api() -> Response:
 
 
 @router.get("/static/{version}/{name}")
-def load(version: str, name: str) -> Response:
+def static_file(version: str, name: str) -> Response:
     """Return a style sheet or script, for browsers to keep; 404 unless the address has the present version."""
     if (version, name) == (viewer_version(), VIEWER):
         return Response(viewer_file(), media_type="text/javascript", headers=_KEPT)
     kind = {**STATIC, **VENDORED}.get(name)
-    if kind is None or version != mark():
+    if kind is None or version != static_version():
         raise HTTPException(404, "no such file; load the page again")
-    return Response(static()[name], media_type=kind, headers=_KEPT)
+    return Response(static_files()[name], media_type=kind, headers=_KEPT)
 
 
 @router.post("/stop")
 async def stop(service: Serving, request: Request, near: Near, cookie: Cookie = None) -> Response:
     """Bring all arms to a controlled stop and show a page of those reached; whoever may by the API may here."""
     done = await stop_all(service, near)
-    back = inside(urlsplit(request.headers.get("referer", "")).path or "/")
+    back = local_path(urlsplit(request.headers.get("referer", "")).path or "/")
     who = service.authenticator.known(None, cookie)
     return page("stopped", who, arms=done.arms, jobs=done.jobs, back="/" if back == "/stop" else back)

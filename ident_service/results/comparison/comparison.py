@@ -150,30 +150,30 @@ class ComparedSet:
         except ParameterError as error:
             raise ParameterError(f"{self.path}: {error}") from None
 
-    def identified(self, places: NDArray[np.intp], *, free: bool) -> ComparedEstimate | None:
+    def identified(self, base_indices: NDArray[np.intp], *, use_unconstrained: bool) -> ComparedEstimate | None:
         """Return values, covariance and motion of some base parameters for the tests; None without a covariance.
 
         Args:
-            places: indices of the parameters, in the order of the comparison.
-            free: whether values are those before they were held in a feasible set.
+            base_indices: indices of the parameters, in the order of the comparison.
+            use_unconstrained: whether values are those before they were held in a feasible set.
         """
         covariance = self.covariance
         if covariance is None:
             return None
-        values = self.unconstrained if free else None
+        values = self.unconstrained if use_unconstrained else None
         values = self.file.values if values is None else values
         fit = self.content.get("fit", {})
-        motion = None if self.information is None else Motion.of(self.information, values, places.tolist())
+        motion = None if self.information is None else Motion.of(self.information, values, base_indices.tolist())
         return ComparedEstimate(
-            tuple(self.leading[place] for place in places),
-            values[places],
-            covariance[np.ix_(places, places)],
+            tuple(self.leading[place] for place in base_indices),
+            values[base_indices],
+            covariance[np.ix_(base_indices, base_indices)],
             fit.get("blocks"),
             motion,
         )
 
 
-def read_side(path: Path) -> ComparedSet:
+def read_side(results_path: Path) -> ComparedSet:
     """Read and check a folder of results or a parameter file, to be compared.
 
     Raises:
@@ -181,13 +181,13 @@ def read_side(path: Path) -> ComparedSet:
         ParameterError: torn, changed or foreign, or values that contradict each other.
         ConfigError: the folder's arm is not one that this version reads.
     """
-    if path.is_dir():
-        results = read_results(path)
-        require_consistent(results.parameters, path / PARAMETERS)
-        return ComparedSet(path, results.sha256[PARAMETERS], results.parameters, results.config)
-    file = read_parameters(path)
-    require_consistent(file, path)
-    return ComparedSet(path, hashlib.sha256(path.read_bytes()).hexdigest(), file)
+    if results_path.is_dir():
+        results = read_results(results_path)
+        require_consistent(results.parameters, results_path / PARAMETERS)
+        return ComparedSet(results_path, results.sha256[PARAMETERS], results.parameters, results.config)
+    file = read_parameters(results_path)
+    require_consistent(file, results_path)
+    return ComparedSet(results_path, hashlib.sha256(results_path.read_bytes()).hexdigest(), file)
 
 
 @dataclass(frozen=True)
@@ -222,17 +222,17 @@ class AppliedValues:
 
 def values_in_use(
     sides: tuple[ComparedSet, ComparedSet],
-    places: Sequence[NDArray[np.intp]],
+    shared_indices: Sequence[NDArray[np.intp]],
     compared: tuple[ComparedEstimate, ComparedEstimate] | None,
 ) -> AppliedValues:
     """Return both sides' values in use, whether the tests used others, and what share of torque they differ by.
 
     Args:
         sides: the reference and the other.
-        places: indices of the shared parameters in each side.
+        shared_indices: indices of the shared parameters in each side.
         compared: both as they are tested; None where they are not.
     """
-    reference, side = (one.file.values[at] for one, at in zip(sides, places, strict=True))
+    reference, side = (one.file.values[at] for one, at in zip(sides, shared_indices, strict=True))
     if compared is None:
         return AppliedValues(reference, side, False, None)
     first, second = compared
@@ -350,7 +350,9 @@ def _pair(reference: ComparedSet, side: ComparedSet) -> Pair:
         raise ParameterError(f"{side.path}: has only friction of another shape in common with {reference.path}")
     places = tuple(np.array(column, dtype=np.intp) for column in zip(*shared, strict=True))
     free = reference.unconstrained is not None and side.unconstrained is not None
-    first, second = (one.identified(at, free=free) for one, at in zip((reference, side), places, strict=True))
+    first, second = (
+        one.identified(at, use_unconstrained=free) for one, at in zip((reference, side), places, strict=True)
+    )
     found, compared, explained, reason = None, None, tuple[Cause, ...](), ""
     if first is None or second is None:
         without = [str(one.path) for one, known in ((reference, first), (side, second)) if known is None]
@@ -549,10 +551,10 @@ def findings(pair: Pair) -> tuple[Finding, ...]:
     return (*whole, *single) or (_whole(pair, found, best, links),)
 
 
-def joint_name(pair: Pair, number: int) -> str:
+def joint_name(pair: Pair, joint_number: int) -> str:
     """Return the name of a joint counted from 1, or its number where the side knows no name."""
     names = pair.side.joints
-    return names[number - 1] if names is not None and number <= len(names) else str(number)
+    return names[joint_number - 1] if names is not None and joint_number <= len(names) else str(joint_number)
 
 
 def _links(pair: Pair) -> int:

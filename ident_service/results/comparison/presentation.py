@@ -39,7 +39,7 @@ from ident_service.results.comparison.comparison import (
 from ident_service.results.evidence.gathering import friction_term
 from ident_service.results.manifest import write_atomically
 from ident_service.results.parameter_file import finite_or_none, require_schema
-from ident_service.results.plots import Axes, Canvas, draw_frame, draw_key, number, range_around, shortened
+from ident_service.results.plots import Axes, Canvas, draw_frame, draw_legend, format_number, range_around, shortened
 from ident_service.results.report.figures import LEFT, RIGHT, WIDTH, Figure
 from ident_service.results.report.rendering import Cell, Table, render
 
@@ -72,9 +72,9 @@ def friction_curves(reference: ComparedSet, pair: Pair, pair_number: int) -> lis
         at = np.concatenate([-half[::-1], half])
         curves = [_curve(side, own[joint], at, joint) for side, own in ((reference, ours), (pair.side, theirs))]
         canvas = Canvas(WIDTH, _TOP + _HEIGHT + _BOTTOM)
-        upright = range_around(*curves, least=1e-6)
-        axes = Axes(LEFT, _TOP, WIDTH - LEFT - RIGHT, _HEIGHT, *range_around(at, least=1e-6), *upright)
-        draw_key(canvas, WIDTH - RIGHT, 16, [("line", "first", "reference"), ("line", "second", "compared")])
+        upright = range_around(*curves, least_length=1e-6)
+        axes = Axes(LEFT, _TOP, WIDTH - LEFT - RIGHT, _HEIGHT, *range_around(at, least_length=1e-6), *upright)
+        draw_legend(canvas, WIDTH - RIGHT, 16, [("line", "first", "reference"), ("line", "second", "compared")])
         torque, speed = _units(reference, joint)
         draw_frame(canvas, axes, x=f"velocity [{speed}]", y=f"friction [{torque}]")
         # The two branches are not joined: at standstill friction is no function of the velocity.
@@ -95,18 +95,18 @@ def friction_curves(reference: ComparedSet, pair: Pair, pair_number: int) -> lis
     return figures
 
 
-def z_figure(found: ParameterChange, pair_number: int) -> Figure:
+def z_figure(change: ParameterChange, pair_number: int) -> Figure:
     """Draw every parameter's difference in standard deviations, on a scale that shows 1 as well as 1000."""
-    size = len(found.z)
-    shown = _squeezed(np.clip(found.z, -_LARGEST_Z, _LARGEST_Z))
+    size = len(change.z)
+    shown = _squeezed(np.clip(change.z, -_LARGEST_Z, _LARGEST_Z))
     canvas = Canvas(WIDTH, _TOP + _HEIGHT + _BOTTOM)
     # Holm's first step: a single parameter beyond these lines is not chance.
     line = float(-ndtri(0.5 * ALPHA / size))
     limit = max(float(np.max(np.abs(shown), initial=0.0)), float(_squeezed(np.array([line]))[0])) * 1.1
     axes = Axes(LEFT, _TOP, WIDTH - LEFT - RIGHT, _HEIGHT, 0.0, size + 1.0, -limit, limit)
-    draw_key(canvas, WIDTH - RIGHT, 16, [("dot", "good", "within chance"), ("area", "bad", "beyond")])
+    draw_legend(canvas, WIDTH - RIGHT, 16, [("dot", "good", "within chance"), ("area", "bad", "beyond")])
     sigmas = [sign * level for level in _levels(limit) for sign in (-1.0, 1.0)[: 2 if level else 1]]
-    ticks = [(float(_squeezed(np.array([level]))[0]), number(level)) for level in sigmas]
+    ticks = [(float(_squeezed(np.array([level]))[0]), format_number(level)) for level in sigmas]
     across = "number of the base parameter, as in the table"
     draw_frame(canvas, axes, x=across, y="difference [\u03c3], closer together the larger it is", y_ticks=ticks)
     for level in (-line, line):
@@ -114,15 +114,15 @@ def z_figure(found: ParameterChange, pair_number: int) -> Figure:
         canvas.line("limit", LEFT, y, WIDTH - RIGHT, y)
     for k in range(size):
         x, y = float(axes.x(k + 1.0)), float(axes.y(shown[k]))
-        beyond = found.p[k] < ALPHA
+        beyond = change.p[k] < ALPHA
         # Shape repeats what colour shows.
         if beyond:
             canvas.rectangle("bad", x - 3.6, y - 3.6, 7.2, 7.2)
         else:
             canvas.circle("good", x, y, 3.4)
-    count = int(np.sum(found.p < ALPHA))
+    count = int(np.sum(change.p < ALPHA))
     words = (
-        f"{count} of {size} parameters differ significantly; the largest |z| is {float(np.max(np.abs(found.z))):.3g}."
+        f"{count} of {size} parameters differ significantly; the largest |z| is {float(np.max(np.abs(change.z))):.3g}."
     )
     return Figure(
         slug=f"z-{pair_number}",
@@ -230,7 +230,7 @@ def _pair(comparison: Comparison, pair: Pair) -> list[str]:
     lines += ["", *_table(comparison.reference, pair)]
     for title, left_out in (("the reference", pair.only_reference), (str(pair.side.path), pair.only_side)):
         if left_out:
-            lines += ["", f"left out, only in {title}:", *(f"  {one}" for one in first_rows(left_out))]
+            lines += ["", f"left out, only in {title}:", *(f"  {one}" for one in shorten_rows(left_out))]
     if pair.provenance:
         lines += ["", "differences in how they were made (reference; compared):"]
         said = {key: both for key, both in pair.provenance.items() if UNSAID not in both}
@@ -288,7 +288,7 @@ def tested_line(pair: Pair) -> str:
     return f"{line}; the values in use, constrained to a feasible set, are beside them" if pair.in_use.apart else line
 
 
-def first_rows(rows: Sequence[str]) -> list[str]:
+def shorten_rows(rows: Sequence[str]) -> list[str]:
     """Return the first few of many rows, and how many more there are."""
     if len(rows) <= _MOST:
         return list(rows)
@@ -513,7 +513,7 @@ def _parameters(reference: ComparedSet, pair: Pair) -> Table:
             cells += [Cell("not excited", kind="bad"), _NOTHING, _NOTHING]
         else:
             z, kind = float(pair.drift.z[k]), "bad" if pair.drift.p[k] < ALPHA else ""
-            cells += [_number(float(pair.drift.deviations[k]), 2), Cell(number(z), z, kind)]
+            cells += [_number(float(pair.drift.deviations[k]), 2), Cell(format_number(z), z, kind)]
             cells.append(_number(float(pair.drift.p[k]), 2))
         rows.append(cells)
     heads = ["no.", "base parameter", "unit", "reference", "compared", "difference", "\u03c3", "z", "p (Holm)"]
@@ -529,7 +529,7 @@ def _parameters(reference: ComparedSet, pair: Pair) -> Table:
 
 def _left_out(pair: Pair) -> list[tuple[str, list[str]]]:
     parts = [("the reference", pair.only_reference), ("the compared", pair.only_side)]
-    return [(name, first_rows(rows)) for name, rows in parts if rows]
+    return [(name, shorten_rows(rows)) for name, rows in parts if rows]
 
 
 def _effects(pair: Pair) -> Table | None:
@@ -583,7 +583,7 @@ def _files(comparison: Comparison) -> Table:
 
 def _errors(side: ComparedSet) -> tuple[Cell, Cell]:
     fit, scores = side.content.get("fit"), side.content.get("validation", [])
-    said = ", ".join(number(one["relative_error_percent"], 4) for one in scores)
+    said = ", ".join(format_number(one["relative_error_percent"], 4) for one in scores)
     return (
         _NOTHING if fit is None else _number(fit["relative_error_percent"], 4),
         Cell(said) if said else _NOTHING,
@@ -591,4 +591,4 @@ def _errors(side: ComparedSet) -> tuple[Cell, Cell]:
 
 
 def _number(value: float, digits: int = 5) -> Cell:
-    return Cell(number(value, digits), value) if np.isfinite(value) else _NOTHING
+    return Cell(format_number(value, digits), value) if np.isfinite(value) else _NOTHING

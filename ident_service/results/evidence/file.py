@@ -41,25 +41,29 @@ def packed(values: Array) -> Packed:
     return {"shape": list(values.shape), "low": low, "step": step, "data": base64.b64encode(data).decode("ascii")}
 
 
-def unpacked(content: Mapping[str, Any], shape: tuple[int | None, ...]) -> Array:
+def unpacked(packed_values: Mapping[str, Any], required_shape: tuple[int | None, ...]) -> Array:
     """Unpack an array that `packed` made, to its resolution.
 
     Args:
-        content: of a file.
-        shape: required shape; None where any length will do.
+        packed_values: of a file.
+        required_shape: required shape; None where any length will do.
 
     Raises:
         ParameterError: not a packed array of this shape.
     """
-    data, given = _bytes(content), tuple(content["shape"])
-    if len(given) != len(shape) or any(want not in (None, have) for want, have in zip(shape, given, strict=True)):
-        raise ParameterError(f"an array of shape {list(given)} where {[n or 'any' for n in shape]} is needed")
+    data, given = _bytes(packed_values), tuple(packed_values["shape"])
+    if len(given) != len(required_shape) or any(
+        want not in (None, have) for want, have in zip(required_shape, given, strict=True)
+    ):
+        raise ParameterError(f"an array of shape {list(given)} where {[n or 'any' for n in required_shape]} is needed")
     if int(np.prod(given)) > _MOST or len(data) != 2 * int(np.prod(given)):
         raise ParameterError(f"an array of shape {list(given)} in {len(data)} bytes")
-    if not abs(content["low"]) + _LEVELS * content["step"] < LARGEST:
-        raise ParameterError(f"an array of numbers up to {abs(content['low']) + _LEVELS * content['step']:.3g}")
+    if not abs(packed_values["low"]) + _LEVELS * packed_values["step"] < LARGEST:
+        raise ParameterError(
+            f"an array of numbers up to {abs(packed_values['low']) + _LEVELS * packed_values['step']:.3g}"
+        )
     levels = np.frombuffer(data, "<i2").astype(float) + 32768.0
-    return np.asarray((content["low"] + content["step"] * levels).reshape(given))
+    return np.asarray((packed_values["low"] + packed_values["step"] * levels).reshape(given))
 
 
 def packed_mask(mask: Mask) -> Packed:
@@ -68,16 +72,18 @@ def packed_mask(mask: Mask) -> Packed:
     return {"bits": len(mask), "data": base64.b64encode(data).decode("ascii")}
 
 
-def unpacked_mask(content: Mapping[str, Any], bits: int) -> Mask:
+def unpacked_mask(packed_values: Mapping[str, Any], required_length: int) -> Mask:
     """Unpack a mask that `packed_mask` made.
 
     Raises:
         ParameterError: not a mask of this length.
     """
-    data = _bytes(content)
-    if content["bits"] != bits or len(data) != -(-bits // 8):
-        raise ParameterError(f"a mask of {content['bits']} bits in {len(data)} bytes where {bits} are needed")
-    return np.unpackbits(np.frombuffer(data, np.uint8), count=bits, bitorder="little").astype(bool)
+    data = _bytes(packed_values)
+    if packed_values["bits"] != required_length or len(data) != -(-required_length // 8):
+        raise ParameterError(
+            f"a mask of {packed_values['bits']} bits in {len(data)} bytes where {required_length} are needed"
+        )
+    return np.unpackbits(np.frombuffer(data, np.uint8), count=required_length, bitorder="little").astype(bool)
 
 
 def _bytes(content: Mapping[str, Any]) -> bytes:

@@ -63,13 +63,13 @@ def conditions_of(estimate: Estimate) -> tuple[Condition, ...]:
     return tuple(found)
 
 
-def bounds_of(tight: tuple[str, ...], conditions: FeasibleSet, base: BaseParameters) -> tuple[tuple[str, ...], ...]:
-    """Return per base parameter the active conditions (`tight`) that involve the first link parameter of its sum."""
+def bounds_of(active: tuple[str, ...], conditions: FeasibleSet, base: BaseParameters) -> tuple[tuple[str, ...], ...]:
+    """Return per base parameter the active conditions (`active`) that involve the first link parameter of its sum."""
     touched = {
         block.name: set(np.flatnonzero(np.any(block.F != 0.0, axis=0)).tolist())
         for block in (*conditions.blocks, *conditions.equalities)
     }
-    return tuple(tuple(name for name in tight if int(column) in touched.get(name, set())) for column in base.base)
+    return tuple(tuple(name for name in active if int(column) in touched.get(name, set())) for column in base.base)
 
 
 def posed(model: ArmModel, delta: Array | None, positions: Array) -> PosedArm | None:
@@ -102,17 +102,17 @@ def _most_spread_posture(points: Array) -> int:
     return int(np.argmax(seen))
 
 
-def ellipsoid(inertial: Array) -> tuple[float, Array, Array | None]:
+def ellipsoid(inertial_parameters: Array) -> tuple[float, Array, Array | None]:
     """Return mass, centre of mass and half axes of the solid ellipsoid that has a body's inertial parameters.
 
     Args:
-        inertial: the ten parameters of eq. 13, about the link frame's origin, shape (10,).
+        inertial_parameters: the ten parameters of eq. 13, about the link frame's origin, shape (10,).
 
     Returns:
         Mass [kg], centre of mass in the link frame [m], shape (3,), zero where the mass is not positive, and half axes
         as rows [m], shape (3, 3), or None where no such ellipsoid exists.
     """
-    xx, xy, xz, yy, yz, zz, lx, ly, lz, m = (float(value) for value in inertial)
+    xx, xy, xz, yy, yz, zz, lx, ly, lz, m = (float(value) for value in inertial_parameters)
     if m <= 0.0:
         return m, np.zeros(3), None
     center = np.array([lx, ly, lz]) / m
@@ -301,9 +301,9 @@ class Welch:
         self._segments = self._samples = 0
         self._window = np.hanning(self.length + 1)[:-1]
 
-    def add(self, values: Array, *, opens: bool = False) -> None:
-        """Add the next samples, (series, samples), to spectrum and correlation; `opens` says a gap lies before them."""
-        self._waiting = values if opens else np.hstack([self._waiting, values])
+    def add(self, values: Array, *, after_gap: bool = False) -> None:
+        """Add the next samples, (series, samples), to spectrum and correlation; `after_gap` if a gap precedes them."""
+        self._waiting = values if after_gap else np.hstack([self._waiting, values])
         self._samples += values.shape[1]
         half = self.length // 2
         while self._waiting.shape[1] >= self.length:
@@ -450,14 +450,14 @@ class FrictionCollector:
         return Friction(x, y, at, curve, tuple(terms))
 
 
-def friction_term(term: JointTerm, velocity: Array, layout: Layout, drive: int) -> Array:
+def friction_term(term: JointTerm, velocity: Array, layout: Layout, drive_index: int) -> Array:
     """Return the torque of a friction term in steady motion per unit of its coefficient, shape of `velocity`.
 
     Args:
         term: one of the model's friction terms.
         velocity: velocity of the drive, not zero [rad/s or m/s].
         layout: layout with the Stribeck velocities.
-        drive: number of the drive.
+        drive_index: number of the drive.
     """
     sign = np.sign(velocity)
     if term == "viscous":
@@ -467,7 +467,7 @@ def friction_term(term: JointTerm, velocity: Array, layout: Layout, drive: int) 
     if term == "offset":
         return np.ones_like(velocity)
     if term == "stribeck":
-        return np.asarray(sign * np.exp(-((velocity / layout.stribeck_velocity[drive]) ** 2)))
+        return np.asarray(sign * np.exp(-((velocity / layout.stribeck_velocity[drive_index]) ** 2)))
     return velocity * np.abs(velocity) if term == "quadratic" else np.abs(velocity)
 
 
@@ -615,7 +615,7 @@ class _TraceCollector:
         # Spectra are of stretches without a gap.
         breaks = np.flatnonzero(np.diff(rows.time, prepend=self._last) > 1.5 * self._period).tolist()
         for begin, end in pairwise(sorted({0, *breaks, len(rows.time)})):
-            self._welch.add(residual[:, begin:end], opens=begin in breaks)
+            self._welch.add(residual[:, begin:end], after_gap=begin in breaks)
         self._last = float(rows.time[-1])
 
     def _look_for_spikes(self, rows: Rows, residual: Array) -> None:

@@ -10,8 +10,8 @@ from ident_service.model.chain import Array
 from ident_service.model.parameter_layout import about_center, body_parameters, from_pseudo_inertia, pseudo_inertia
 
 
-def moved(parameters: Array, rotation: Array, translation: Array) -> Array:
-    """Return a body's ten parameters of eq. 13, (10,), in another frame, in which its own has the pose given.
+def in_other_frame(parameters: Array, rotation: Array, translation: Array) -> Array:
+    """Return a body's ten parameters (eq. 13) in another frame, in which its own frame has this rotation and origin.
 
     Args:
         parameters: parameters of eq. 13, shape (10,).
@@ -49,7 +49,7 @@ def joint_bodies(model: ArmModel, delta: Array) -> Array:
     chain = model.chain
     bodies = np.array(
         [
-            moved(delta[model.layout.inertial(k)], chain.link_rotation[k], chain.link_translation[k])
+            in_other_frame(delta[model.layout.inertial(k)], chain.link_rotation[k], chain.link_translation[k])
             for k in range(chain.joints)
         ]
     )
@@ -59,8 +59,8 @@ def joint_bodies(model: ArmModel, delta: Array) -> Array:
     return bodies
 
 
-def require_real(model: ArmModel, bodies: Array, reader: str) -> None:
-    """Raise ModelError if no real mass distribution has one of the bodies, which the program `reader` refuses.
+def require_real(model: ArmModel, bodies: Array, program: str) -> None:
+    """Raise ModelError if no real mass distribution has one of the bodies, which `program` refuses.
 
     Raises:
         ModelError: no distribution of mass has the inertia of a link.
@@ -68,6 +68,6 @@ def require_real(model: ArmModel, bodies: Array, reader: str) -> None:
     for name, body in zip(model.chain.names, bodies, strict=True):
         if not is_real(body):
             raise ModelError(
-                f"the link of {name} has an inertia that no distribution of mass has, which {reader} refuses; "
+                f"the link of {name} has an inertia that no distribution of mass has, which {program} refuses; "
                 "identify with the feasible set pseudo_inertia"
             )

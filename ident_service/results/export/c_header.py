@@ -33,7 +33,7 @@ from ident_service.results.export.round_trip import (
     torque,
     with_terms,
 )
-from ident_service.results.export.words import identifier, plain, unique
+from ident_service.results.export.words import comment_text, identifier, unique
 
 _OPERATORS = {"mul": "*", "add": "+", "sub": "-"}
 _FUNCTIONS = {"sin": "sin", "cos": "cos", "exp": "exp", "abs": "fabs"}
@@ -48,18 +48,18 @@ _SIGN = re.compile(rf"^    const double (x\d+) = \(double\)\(\(({_OPERAND}) > 0\
 _RESULT = re.compile(rf"^    ([a-zA-Z]+)\[(\d+)\] = ({_OPERAND});$")
 
 
-def c_lines(tape: ExpressionGraph, inputs: Mapping[int, str], outputs: Sequence[tuple[str, Value]]) -> list[str]:
+def c_lines(graph: ExpressionGraph, inputs: Mapping[int, str], outputs: Sequence[tuple[str, Value]]) -> list[str]:
     """Return the C statements, indented, that compute the outputs of an expression graph from its inputs.
 
     Args:
-        tape: recorded expression graph.
+        graph: recorded expression graph.
         inputs: C expressions of the tape's inputs, by index.
         outputs: targets and their values; all of them are written after everything has been read.
     """
     names = dict(inputs)
     lines: list[str] = []
-    for at in needed_steps(tape, [value.index for _, value in outputs if isinstance(value, Symbol)]):
-        operation, a, b = tape.steps[at]
+    for at in needed_steps(graph, [value.index for _, value in outputs if isinstance(value, Symbol)]):
+        operation, a, b = graph.steps[at]
         if operation == "input":
             continue
         first, second = (_operand(value, names) for value in (a, b))
@@ -163,7 +163,7 @@ def _written(arm: IdentifiedArm) -> str:
         f"#define {name}_JOINTS {n}\n#define {name}_BASE_PARAMETERS {nb}\n",
         "/* Places of the joints in every array. */\nenum {\n"
         + ",\n".join(
-            f"    {joint} = {k} /* {plain(own)}, {'rad' if turns else 'm'} */"
+            f"    {joint} = {k} /* {comment_text(own)}, {'rad' if turns else 'm'} */"
             for k, (joint, own, turns) in enumerate(zip(joints, model.chain.names, model.chain.revolute, strict=True))
         )
         + "\n};\n",
@@ -178,11 +178,11 @@ def _written(arm: IdentifiedArm) -> str:
 def _preface(arm: IdentifiedArm, name: str) -> str:
     gravity = ", ".join(repr(float(g)) for g in arm.model.chain.gravity)
     terms = ", ".join(arm.model.layout.terms).replace("_", " ") or "none"
-    sigma = f" * Mind: {plain(arm.deviations_note)}.\n *\n" if arm.deviations_note else ""
-    lines = textwrap.wrap(plain(arm.forbidden_note), 115)
+    sigma = f" * Mind: {comment_text(arm.deviations_note)}.\n *\n" if arm.deviations_note else ""
+    lines = textwrap.wrap(comment_text(arm.forbidden_note), 115)
     forbidden = "".join(f" * {line}".rstrip() + "\n" for line in [*lines, ""] if lines)
     return f"""\
-/* Dynamics of the arm {plain(arm.model.config.name)} in identified base parameters.
+/* Dynamics of the arm {comment_text(arm.model.config.name)} in identified base parameters.
  *
 {forbidden} * SI units: rad or m, rad/s or m/s, rad/s^2 or m/s^2, N m or N, kg, s. Torque and force are on the
  * joint's side, positive along the joint's axis. Gravity ({gravity}) m/s^2 in the base frame is part of the formulas.
@@ -218,7 +218,7 @@ def _turning_comment(arm: IdentifiedArm, name: str) -> str:
     said = presliding_notes(arm)
     if not said:
         return ""
-    lines = textwrap.wrap(plain(said[0]) + ".", 115)
+    lines = textwrap.wrap(comment_text(said[0]) + ".", 115)
     lines += [
         "",
         f"  {name}_turned(step, before, direction)          direction of each drive's dry friction after a step of the",
@@ -235,7 +235,7 @@ def _parameters(arm: IdentifiedArm, name: str) -> str:
     for k, (expression, unit, value) in enumerate(zip(arm.base.expressions, arm.base.units, arm.beta, strict=True)):
         sigma = "" if (deviation := arm.sigma[k]) is None else f", standard deviation {deviation:.2g}"
         comma = "," if k + 1 < count else ""
-        said = f"{k} {plain(expression)} [{unit}]{sigma}"
+        said = f"{k} {comment_text(expression)} [{unit}]{sigma}"
         lines.append(f"    {float(value)!r}{comma} /* {said} */")
     body = "\n".join(lines)
     return (
@@ -334,12 +334,12 @@ static inline void NAME_inverse_dynamics(const double q[], const double dq[], co
 """
 
 
-def read_c_header(text: str, name: str, function: str, states: dict[str, Array]) -> Array:
+def read_c_header(text: str, prefix: str, function: str, states: dict[str, Array]) -> Array:
     """Compute, from a header's text alone, what one of its functions writes for these states, (values, samples).
 
     Args:
         text: the header.
-        name: prefix of the names in it.
+        prefix: prefix of the names in it.
         function: `rigid_dynamics`, `friction`, `gravity` or `mass_matrix`.
         states: `q`, `dq` and `ddq`, each of shape (joints, samples).
 
@@ -348,11 +348,11 @@ def read_c_header(text: str, name: str, function: str, states: dict[str, Array])
     """
     lines = text.splitlines()
     try:
-        at = lines.index(f"static const double {name}_base_parameters[{name}_BASE_PARAMETERS] = {{")
-        begin = next(k for k, line in enumerate(lines) if line.startswith(f"static inline void {name}_{function}("))
+        at = lines.index(f"static const double {prefix}_base_parameters[{prefix}_BASE_PARAMETERS] = {{")
+        begin = next(k for k, line in enumerate(lines) if line.startswith(f"static inline void {prefix}_{function}("))
         numbers, body = lines[at + 1 : lines.index("};", at)], lines[begin + 2 : lines.index("}", begin)]
     except (ValueError, StopIteration):
-        raise ModelError(f"not a header of {name} with {function}") from None
+        raise ModelError(f"not a header of {prefix} with {function}") from None
     found = [_PARAMETER.match(line) for line in numbers]
     samples = next(iter(states.values())).shape[1]
     p = np.array([[float(match.group(1)) if match else np.nan] * samples for match in found])

@@ -281,13 +281,13 @@ FORMATS: dict[str, Callable[[IdentifiedArm], Export]] = {
 }
 
 
-def known_formats(words: str) -> tuple[str, ...]:
+def known_formats(format_list: str) -> tuple[str, ...]:
     """Parse the names of formats in a list with commas, each once; raise UsageError for unknown ones or none.
 
     Raises:
         UsageError: none, or one that is not there.
     """
-    named = tuple(dict.fromkeys(word.strip() for word in words.split(",") if word.strip()))
+    named = tuple(dict.fromkeys(word.strip() for word in format_list.split(",") if word.strip()))
     if unknown := [word for word in named if word not in FORMATS]:
         raise UsageError(f"no export format {', '.join(map(repr, unknown))}: formats are {', '.join(FORMATS)}")
     if not named:
@@ -306,7 +306,7 @@ def export_texts(arm: IdentifiedArm, formats: Sequence[str]) -> tuple[Export, ..
 
 
 def export_run(
-    run: Path,
+    results_folder: Path,
     formats: Sequence[str],
     folder: Path,
     step: Callable[[str, float], None] = lambda words, share: None,
@@ -316,7 +316,7 @@ def export_run(
     """Write a folder of results in some formats into a folder, all files or none; return what was written.
 
     Args:
-        run: the folder, every file in it as its manifest says.
+        results_folder: the folder, every file in it as its manifest says.
         formats: names of the formats, of `FORMATS`.
         folder: folder for the files; others in it stay.
         step: called with each format before it is made, and the share of them that is done, from 0 to 1.
@@ -331,11 +331,11 @@ def export_run(
         ParameterError: the files of the run are torn, changed or foreign.
         ConfigError, ModelError: the arm in it cannot be used, or a format cannot carry it.
     """
-    arm, made = read_identified(run), list[Export]()
+    arm, made = read_identified(results_folder), list[Export]()
     if arm.forbidden and not anyway:
         raise MustNotBeUsed(
-            f"{run}: must not be used: {'; '.join(reason.rstrip('.') for reason in arm.forbidden)}; nothing was "
-            "exported; identify again and export that, or export it marked, with --anyway, where the folder is"
+            f"{results_folder}: must not be used: {'; '.join(reason.rstrip('.') for reason in arm.forbidden)}; nothing "
+            "was exported; identify again and export that, or export it marked, with --anyway, where the folder is"
         )
     for name in known_formats(",".join(formats)):
         step(f"exporting {name}", len(made) / len(formats))

@@ -96,14 +96,16 @@ class IdentifiedArm:
         return self.delta
 
 
-def identified_arm(config: ArmConfig, parameters: ParameterFile, source: str, where: Path) -> IdentifiedArm:
+def identified_arm(
+    config: ArmConfig, parameters: ParameterFile, parameters_sha256: str, parameter_path: Path
+) -> IdentifiedArm:
     """Check that a parameter file is of an arm and consistent, and combine the two.
 
     Args:
         config: the arm, its friction's shape as identified.
         parameters: of that arm.
-        source: SHA-256 of the parameter file.
-        where: the parameter file, for errors.
+        parameters_sha256: SHA-256 of the parameter file.
+        parameter_path: the parameter file, for errors.
 
     Raises:
         ModelError: the mechanism cannot be represented.
@@ -114,28 +116,28 @@ def identified_arm(config: ArmConfig, parameters: ParameterFile, source: str, wh
     try:
         base = base_from_expressions(tuple(table["expressions"]), names)
     except ParameterError as error:
-        raise ParameterError(f"{where}: not parameters of {config.name}: {error}") from None
+        raise ParameterError(f"{parameter_path}: not parameters of {config.name}: {error}") from None
     base = replace(base, units=tuple(model.layout.units[column] for column in base.base))
     H = joint_regressor(model.chain, model.layout, *random_states(model.chain.joints))
     grouped = np.linalg.solve(base.K[:, base.base], base.K)
     if disagreement(np.einsum("jbs,bp->jps", H[:, base.base], grouped), H) > AGREEMENT:
         raise ParameterError(
-            f"{where}: its expressions do not group the parameters of {config.name} as its motion does"
+            f"{parameter_path}: its expressions do not group the parameters of {config.name} as its motion does"
         )
-    require_consistent(parameters, where)
+    require_consistent(parameters, parameter_path)
     sigma, verdicts = table.get("standard_deviations"), table.get("verdicts")
     known = parameters.content.get("information")
     return IdentifiedArm(
         model=model,
         base=base,
         beta=parameters.values,
-        delta=_link_values(parameters, base, where),
+        delta=_link_values(parameters, base, parameter_path),
         sigma=tuple(sigma or [None] * base.size),
         verdicts=tuple(verdicts or [""] * base.size),
-        source=source,
+        source=parameters_sha256,
         feasible_set=parameters.feasible_set or "none",
         unconstrained=None if (free := table.get("unconstrained_values")) is None else np.array(free, dtype=float),
-        motion=None if known is None else _motion(parameters.content, base, model, where),
+        motion=None if known is None else _motion(parameters.content, base, model, parameter_path),
         forbidden=forbidden_because(parameters.content),
     )
 

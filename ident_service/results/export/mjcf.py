@@ -26,14 +26,18 @@ from ident_service.results.export.round_trip import (
     supported_terms,
     unsupported_terms,
 )
-from ident_service.results.export.urdf import xml_places
+from ident_service.results.export.urdf import parse_xml_with_places
 from ident_service.results.export.words import comments, unique
 
 _ATTRIBUTES = dict(zip(JOINT_TERMS, ("armature", "damping", "frictionloss"), strict=True))
 
 
 def mjcf_export(
-    model: ArmModel, delta: Array, file_name: str, said: tuple[str, ...] = (), motion: RecordedMotion | None = None
+    model: ArmModel,
+    delta: Array,
+    file_name: str,
+    comment_notes: tuple[str, ...] = (),
+    motion: RecordedMotion | None = None,
 ) -> tuple[str, tuple[str, ...]]:
     """Return (MJCF text, what it does not carry), after pinocchio has read it back with the same torques.
 
@@ -41,7 +45,7 @@ def mjcf_export(
         model: the arm.
         delta: link parameters, shape (layout.size,).
         file_name: name of the file, for errors.
-        said: statements about its bodies, for a comment in it.
+        comment_notes: statements about its bodies, for a comment in it.
         motion: motion that the arm was identified from, which says how large the torque of what is lost is.
 
     Raises:
@@ -55,7 +59,7 @@ def mjcf_export(
     lost = unsupported_terms(model, delta, everything, motion)
     if any(joint.velocity is not None for joint in model.config.joints.values()):
         lost = (*lost, "velocity limits")
-    text = _text(model, delta, has, shared, lost, said)
+    text = _text(model, delta, has, shared, lost, comment_notes)
     written = read_back(TextFile(name=file_name, text=text), "mjcf", gravity_of(model))
     require_same_torques(model, delta, written, has, file_name)
     _require_same_tendons(model, delta, text, shared, file_name)
@@ -134,7 +138,7 @@ def _add_tendons(root: ET.Element, model: ArmModel, delta: Array, shared: Carrie
 def _require_same_tendons(model: ArmModel, delta: Array, text: str, shared: Carried, name: str) -> None:
     """Check the tendons in the file against the drives, as pinocchio reads no tendons."""
     chain, own = model.chain, joint_drives(model.chain, model.layout, delta).own
-    section = xml_places(text, name).first("tendon")
+    section = parse_xml_with_places(text, name).first("tendon")
     fixed = [] if section is None else list(section.all("fixed"))
     coupling = np.zeros((len(fixed), chain.joints))
     found = np.zeros((len(fixed), len(shared)))

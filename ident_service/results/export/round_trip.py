@@ -42,11 +42,11 @@ def gravity_of(model: ArmModel) -> tuple[float, float, float]:
     return x, y, z
 
 
-def disagreement(found: Array, meant: Array) -> float:
+def disagreement(computed: Array, expected: Array) -> float:
     """Return the largest |found - meant| over the largest |meant|; infinite where something found is not finite."""
-    if not np.all(np.isfinite(found)):
+    if not np.all(np.isfinite(computed)):
         return np.inf
-    return float(np.abs(found - meant).max() / max(np.abs(meant).max(), np.finfo(float).tiny))
+    return float(np.abs(computed - expected).max() / max(np.abs(expected).max(), np.finfo(float).tiny))
 
 
 def torque(model: ArmModel, delta: Array, states: States) -> Array:
@@ -54,53 +54,55 @@ def torque(model: ArmModel, delta: Array, states: States) -> Array:
     return np.asarray(np.einsum("jps,p->sj", joint_regressor(model.chain, model.layout, *states), delta))
 
 
-def with_terms(model: ArmModel, delta: Array, terms: Collection[JointTerm]) -> Array:
-    """Return a copy of the parameters in which the joint terms in `terms` are kept and all others are zero."""
+def with_terms(model: ArmModel, delta: Array, kept_terms: Collection[JointTerm]) -> Array:
+    """Return a copy of the link parameters in which the joint terms outside `kept_terms` are zero."""
     kept, layout = np.array(delta, dtype=float), model.layout
     for term in layout.terms:
-        if term not in terms:
+        if term not in kept_terms:
             kept[layout.term_columns(term)] = 0.0
     return kept
 
 
-def supported_terms(model: ArmModel, delta: Array, terms: Collection[JointTerm]) -> Carried:
+def supported_terms(model: ArmModel, delta: Array, format_terms: Collection[JointTerm]) -> Carried:
     """Map each joint term of a format to a mask of the joints whose value it can hold: not negative, with own drive."""
     drives = joint_drives(model.chain, model.layout, delta)
-    known = [term for term in JOINT_TERMS if term in terms and term in model.layout.terms]
+    known = [term for term in JOINT_TERMS if term in format_terms and term in model.layout.terms]
     return {term: drives.own & (drives.of(term) >= 0.0) for term in known}
 
 
-def require_same_torques(model: ArmModel, delta: Array, written: WrittenArm, has: Carried, file_name: str) -> None:
+def require_same_torques(
+    model: ArmModel, delta: Array, read_back: WrittenArm, carried: Carried, file_name: str
+) -> None:
     """Raise ModelError unless an arm read from a file predicts the parameters' torques, in the terms that it carries.
 
     Args:
         model: the arm.
         delta: link parameters, shape (layout.size,).
-        written: arm that was read back.
-        has: terms that the file carries.
+        read_back: arm that was read back.
+        carried: terms that the file carries.
         file_name: name of the file.
 
     Raises:
         ModelError: other joints, or other torques.
     """
     refused = f"{file_name}: what is read back differs from the parameters"
-    if sorted(written.chain.names) != sorted(model.chain.names):
-        raise ModelError(f"{refused}: its joints are {', '.join(written.chain.names)}; it was not written")
-    order = [written.chain.names.index(joint) for joint in model.chain.names]
-    layout = Layout(written.chain.revolute, JOINT_TERMS)
+    if sorted(read_back.chain.names) != sorted(model.chain.names):
+        raise ModelError(f"{refused}: its joints are {', '.join(read_back.chain.names)}; it was not written")
+    order = [read_back.chain.names.index(joint) for joint in model.chain.names]
+    layout = Layout(read_back.chain.revolute, JOINT_TERMS)
     values = np.zeros((layout.joints, layout.per_link))
-    values[:, :10] = written.bodies
+    values[:, :10] = read_back.bodies
     states = position, velocity, acceleration = random_states(model.chain.joints)
     shape: dict[JointTerm, Array] = {"drive_inertia": acceleration, "viscous": velocity, "coulomb": np.sign(velocity)}
-    found = dict(zip(JOINT_TERMS, (written.armature, written.damping, written.friction), strict=True))
+    found = dict(zip(JOINT_TERMS, (read_back.armature, read_back.damping, read_back.friction), strict=True))
     drives = joint_drives(model.chain, model.layout, delta)
     meant = torque(model, with_terms(model, delta, ()), states)
     for place, term in enumerate(JOINT_TERMS):
-        if term in has:
-            values[order, 10 + place] = np.where(has[term], found[term][order], 0.0)
-            meant = meant + np.where(has[term], drives.of(term), 0.0) * shape[term]
+        if term in carried:
+            values[order, 10 + place] = np.where(carried[term], found[term][order], 0.0)
+            meant = meant + np.where(carried[term], drives.of(term), 0.0) * shape[term]
     back = np.argsort(order)  # from our order to the file's
-    H = joint_regressor(written.chain, layout, position[:, back], velocity[:, back], acceleration[:, back])
+    H = joint_regressor(read_back.chain, layout, position[:, back], velocity[:, back], acceleration[:, back])
     predicted = np.einsum("jps,p->sj", H, values.ravel())[:, order]
     if not (apart := disagreement(predicted, meant)) <= AGREEMENT:
         raise ModelError(f"{refused}: torques are up to {apart:.1e} of the largest apart; it was not written")
@@ -147,9 +149,9 @@ class RecordedMotion:
         ]
         return np.asarray(np.sqrt(np.array(sums) / np.maximum(self.rows, 1.0)))
 
-    def in_words(self, model: ArmModel, delta: Array) -> str:
-        """Describe the torque of `delta`, parameters that are lost, at each joint where it counts, largest first."""
-        torques = self.torque(delta)
+    def in_words(self, model: ArmModel, lost_delta: Array) -> str:
+        """Describe the torque of link parameters that are lost, at each joint where it counts, the largest first."""
+        torques = self.torque(lost_delta)
         own = np.sqrt(self.information.squared_torques() / np.maximum(self.rows, 1.0))
         told = torques > _TOLD * own
         units = ["N m" if turns else "N" for turns in model.chain.revolute]
@@ -160,20 +162,20 @@ class RecordedMotion:
 
 
 def unsupported_terms(
-    model: ArmModel, delta: Array, has: Carried, motion: RecordedMotion | None = None
+    model: ArmModel, delta: Array, carried: Carried, motion: RecordedMotion | None = None
 ) -> tuple[str, ...]:
     """Return the joint terms with a value that a file does not carry, in words, with their torque where it is known.
 
     Args:
         model: the arm.
         delta: link parameters, shape (layout.size,).
-        has: terms that the file carries.
+        carried: terms that the file carries.
         motion: motion that the arm was identified from; None where it is not known.
     """
     found = []
     for term in model.layout.terms:
         values = model.layout.term_values(term, delta)
-        missing = (values != 0.0) & ~has.get(term, np.zeros(model.chain.joints, dtype=bool))
+        missing = (values != 0.0) & ~carried.get(term, np.zeros(model.chain.joints, dtype=bool))
         if missing.any():
             joints = "every joint" if missing.all() else ", ".join(np.array(model.chain.names)[missing])
             lost = np.zeros(model.layout.size)

@@ -23,7 +23,7 @@ from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.parameter_layout import WrittenArm, about_center, joint_drives
 from ident_service.model.solids import rotation_rpy
 from ident_service.model.urdf import roll_pitch_yaw
-from ident_service.results.export.bodies import about_origin, joint_bodies, moved, require_real
+from ident_service.results.export.bodies import about_origin, in_other_frame, joint_bodies, require_real
 from ident_service.results.export.round_trip import (
     Carried,
     RecordedMotion,
@@ -32,7 +32,7 @@ from ident_service.results.export.round_trip import (
     supported_terms,
     unsupported_terms,
 )
-from ident_service.results.export.urdf import Element, xml_places
+from ident_service.results.export.urdf import Element, parse_xml_with_places
 from ident_service.results.export.words import comments, unique
 
 _KINDS = {"revolute": True, "continuous": True, "prismatic": False}
@@ -61,7 +61,7 @@ def read_sdf(
 
 class _Reader:
     def __init__(self, text: str, name: str) -> None:
-        root = xml_places(text, name)
+        root = parse_xml_with_places(text, name)
         self._data = text.encode("utf-8")
         model = root.first("model") if root.tag == "sdf" else None
         if model is None:
@@ -82,7 +82,7 @@ class _Reader:
             before = np.eye(4) if parents[-1] == WORLD else frames[parents[-1]]
             placements.append(np.linalg.inv(before) @ frames[-1])
             to_joint: Array = np.linalg.inv(in_child).astype(float)
-            bodies.append(moved(self._body(self._links[child]), to_joint[:3, :3], to_joint[:3, 3]))
+            bodies.append(in_other_frame(self._body(self._links[child]), to_joint[:3, :3], to_joint[:3, 3]))
             revolute.append(_KINDS[joint.attributes["type"]])
             axis = _only(joint, "axis")
             if _only(axis, "xyz").attributes:
@@ -163,7 +163,11 @@ _ENTRIES = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (
 
 
 def sdf_export(
-    model: ArmModel, delta: Array, file_name: str, said: tuple[str, ...] = (), motion: RecordedMotion | None = None
+    model: ArmModel,
+    delta: Array,
+    file_name: str,
+    comment_notes: tuple[str, ...] = (),
+    motion: RecordedMotion | None = None,
 ) -> tuple[str, tuple[str, ...], tuple[str, ...]]:
     """Return (SDF text, what it does not carry, notes), after it was read back with the same torques.
 
@@ -171,7 +175,7 @@ def sdf_export(
         model: the arm.
         delta: link parameters, shape (layout.size,).
         file_name: name of the file, for errors.
-        said: statements about its bodies, for a comment in it.
+        comment_notes: statements about its bodies, for a comment in it.
         motion: motion that the arm was identified from, which says how large the torque of what is lost is.
 
     Raises:
@@ -181,7 +185,7 @@ def sdf_export(
     gravity = ("gravity",) if model.chain.gravity.any() else ()
     lost = (*gravity, *unsupported_terms(model, delta, has, motion))
     joints = _names(model)
-    text = _text(model, delta, has, joints, lost, said)
+    text = _text(model, delta, has, joints, lost, comment_notes)
     written = read_sdf(text, file_name, gravity_of(model), dict(zip(joints, model.chain.names, strict=True)))
     require_same_torques(model, delta, written, has, file_name)
     renamed = [f"{own} is called {new}" for own, new in zip(model.chain.names, joints, strict=True) if own != new]

@@ -29,7 +29,7 @@ from ident_service.model.chain import Array
 from ident_service.model.parameter_layout import about_center, joint_drives
 from ident_service.model.solids import rotation_rpy
 from ident_service.model.urdf import urdf_text
-from ident_service.results.export.bodies import about_origin, is_real, joint_bodies, moved
+from ident_service.results.export.bodies import about_origin, in_other_frame, is_real, joint_bodies
 from ident_service.results.export.round_trip import (
     Carried,
     RecordedMotion,
@@ -39,7 +39,7 @@ from ident_service.results.export.round_trip import (
     supported_terms,
     unsupported_terms,
 )
-from ident_service.results.export.words import plain
+from ident_service.results.export.words import comment_text
 from ident_service.results.manifest import write_atomically
 
 _DEEPEST = 200
@@ -76,7 +76,7 @@ class Element:
         return next(self.all(tag), None)
 
     @property
-    def open(self) -> bool:
+    def has_end_tag(self) -> bool:
         """Return whether the element has an end tag of its own, unlike `<tag/>`."""
         return self.foot != self.head or self.end != self.head
 
@@ -90,7 +90,7 @@ class Edit:
     text: str
 
 
-def xml_places(text: str, file_name: str) -> Element:
+def parse_xml_with_places(text: str, file_name: str) -> Element:
     """Parse XML into elements that know their places [bytes] in the text; return the root, others are its children.
 
     Raises:
@@ -163,13 +163,13 @@ def start_tag(tag: str, attributes: Mapping[str, str], *, closed: bool = True) -
     return f"<{tag}{listed}{'/' if closed else ''}>"
 
 
-def with_attributes(element: Element, changes: Mapping[str, str]) -> Edit:
+def attributes_edit(element: Element, changes: Mapping[str, str]) -> Edit:
     """Return an edit that changes or adds attributes; the others keep their order, the element's content stays."""
     attributes = {**element.attributes, **changes}
-    return Edit(element.start, element.head, start_tag(element.tag, attributes, closed=not element.open))
+    return Edit(element.start, element.head, start_tag(element.tag, attributes, closed=not element.has_end_tag))
 
 
-def with_child(text: str, element: Element, lines: Sequence[str]) -> Edit:
+def child_edit(text: str, element: Element, lines: Sequence[str]) -> Edit:
     """Return an edit that adds lines at the end of an element's content, two columns further in than it.
 
     Lines that begin with blanks go further in.
@@ -179,7 +179,7 @@ def with_child(text: str, element: Element, lines: Sequence[str]) -> Edit:
     before = data[line_start : element.start].decode("utf-8", errors="replace")
     margin = before[: len(before) - len(before.lstrip())]
     block = "".join(f"\n{margin}  {line}" for line in lines)
-    if not element.open:
+    if not element.has_end_tag:
         tag = start_tag(element.tag, element.attributes, closed=False)
         return Edit(element.start, element.head, f"{tag}{block}\n{margin}</{element.tag}>")
     # After the last thing that is not white space, so that the last tag keeps its place.
@@ -192,13 +192,13 @@ _ENTRIES = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (
 _FRICTION: dict[JointTerm, str] = {"viscous": "damping", "coulomb": "friction"}
 
 
-def original_urdf(model: ArmModel, delta: Array, has: Carried) -> tuple[str, tuple[str, ...]]:
+def original_urdf(model: ArmModel, delta: Array, carried: Carried) -> tuple[str, tuple[str, ...]]:
     """Return the arm's own URDF text with identified values put in, all else unchanged, and notes on its bodies.
 
     Args:
         model: model of an arm that a URDF describes.
         delta: link parameters, shape (layout.size,).
-        has: the friction terms to write.
+        carried: the friction terms to write.
 
     Returns:
         The text, and what a reader should know about where bodies went.
@@ -212,7 +212,7 @@ def original_urdf(model: ArmModel, delta: Array, has: Carried) -> tuple[str, tup
     if file is None:
         raise ModelError(f"{model.config.name}: is not described by a URDF")
     held = read_mechanism(file, "urdf", model.config.kinematics).held
-    robot = _Robot(xml_places(file.text, file.name), file.name, held)
+    robot = _Robot(parse_xml_with_places(file.text, file.name), file.name, held)
     edits: list[Edit] = []
     notes: list[str] = []
     drives = joint_drives(model.chain, model.layout, delta)
@@ -236,7 +236,9 @@ def original_urdf(model: ArmModel, delta: Array, has: Carried) -> tuple[str, tup
             edits += [_removed(robot.links[name], file.name) for name, _ in bolted]
         edits += _inertial(file.text, robot.links[link], whole)
         written = {
-            key: repr(float(drives.of(term)[k])) for term, key in _FRICTION.items() if term in has and has[term][k]
+            key: repr(float(drives.of(term)[k]))
+            for term, key in _FRICTION.items()
+            if term in carried and carried[term][k]
         }
         edits += _dynamics(file.text, joint, written)
         if kept := _other_friction(joint, written):
@@ -280,7 +282,7 @@ class _Robot:
             own = _ten(self.links[bolt.child], self._name)
             further = [(bolt.child, own), *self.bolted_to(bolt.child)]
             for name, body in further:
-                yield name, None if body is None else moved(body, bolt.rotation, bolt.translation)
+                yield name, None if body is None else in_other_frame(body, bolt.rotation, bolt.translation)
 
 
 def _named(joint: Element, role: str, name: str) -> str:
@@ -339,9 +341,9 @@ def _inertial(text: str, link: Element, body: Array) -> Iterator[Edit]:
         "inertia": {key: repr(float(inertia[place]) + 0.0) for key, place in _ENTRIES.items()},
     }
     inertial = link.first("inertial")
-    if inertial is None or not inertial.open:
+    if inertial is None or not inertial.has_end_tag:
         lines = ["<inertial>", *(f"  {start_tag(tag, values)}" for tag, values in wanted.items()), "</inertial>"]
-        yield with_child(text, link, lines) if inertial is None else Edit(inertial.start, inertial.end, "".join(lines))
+        yield child_edit(text, link, lines) if inertial is None else Edit(inertial.start, inertial.end, "".join(lines))
         return
     missing = []
     for tag, values in wanted.items():
@@ -349,9 +351,9 @@ def _inertial(text: str, link: Element, body: Array) -> Iterator[Edit]:
         if element is None:
             missing.append(start_tag(tag, values))
         else:
-            yield with_attributes(element, values)
+            yield attributes_edit(element, values)
     if missing:
-        yield with_child(text, inertial, missing)
+        yield child_edit(text, inertial, missing)
 
 
 def _removed(link: Element, name: str) -> Edit:
@@ -371,9 +373,9 @@ def _other_friction(joint: Element, written: dict[str, str]) -> list[str]:
 def _dynamics(text: str, joint: Element, values: dict[str, str]) -> Iterator[Edit]:
     element = joint.first("dynamics")
     if element is not None and values:
-        yield with_attributes(element, values)
+        yield attributes_edit(element, values)
     elif any(float(value) for value in values.values()):
-        yield with_child(text, joint, [start_tag("dynamics", values)])
+        yield child_edit(text, joint, [start_tag("dynamics", values)])
 
 
 _MARK = "ident-service: "
@@ -382,7 +384,11 @@ _TERMS: tuple[JointTerm, ...] = ("viscous", "coulomb")
 
 
 def urdf_export(
-    model: ArmModel, delta: Array, file_name: str, said: tuple[str, ...] = (), motion: RecordedMotion | None = None
+    model: ArmModel,
+    delta: Array,
+    file_name: str,
+    comment_notes: tuple[str, ...] = (),
+    motion: RecordedMotion | None = None,
 ) -> tuple[str, tuple[str, ...], tuple[str, ...]]:
     """Return (URDF text, what it does not carry, notes), after pinocchio has read it back with the same torques.
 
@@ -390,7 +396,7 @@ def urdf_export(
         model: the arm.
         delta: link parameters, shape (layout.size,).
         file_name: name of the file, for errors.
-        said: statements about its bodies, for a comment at its end.
+        comment_notes: statements about its bodies, for a comment at its end.
         motion: motion that the arm was identified from, which says how large the torque of what is lost is.
 
     Raises:
@@ -409,7 +415,7 @@ def urdf_export(
         text = urdf_text(model, delta)
     gravity = "gravity" if model.chain.gravity.any() else ""
     unwritten = unsupported_terms(model, delta, has, motion)
-    text = _commented(text, (*presliding_left_out(model, delta), *said))
+    text = _commented(text, (*presliding_left_out(model, delta), *comment_notes))
     written = read_back(TextFile(name=file_name, text=text), "urdf", gravity_of(model), own)
     require_same_torques(model, delta, written, has, file_name)
     return text, tuple(filter(None, (gravity, *unwritten))), notes
@@ -420,7 +426,11 @@ def _commented(text: str, said: tuple[str, ...]) -> str:
     kept = _EARLIER.sub("", text)
     if not said:
         return kept
-    return kept + ("" if kept.endswith("\n") else "\n") + "".join(f"<!-- {_MARK}{plain(one)}. -->\n" for one in said)
+    return (
+        kept
+        + ("" if kept.endswith("\n") else "\n")
+        + "".join(f"<!-- {_MARK}{comment_text(one)}. -->\n" for one in said)
+    )
 
 
 def write_urdf(path: Path, model: ArmModel, delta: Array) -> None:

@@ -25,12 +25,12 @@ def unique(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def comments(lost: Sequence[str], said: Sequence[str]) -> tuple[str, ...]:
+def comments(lost: Sequence[str], notes: Sequence[str]) -> tuple[str, ...]:
     """Return a file's comments on itself: what its format has no place for, and notes for its reader."""
-    parts = ([f"This format has no place for: {'; '.join(lost)}"] if lost else []) + list(said)
-    return tuple(f" {plain(part)}. " for part in parts)
+    parts = ([f"This format has no place for: {'; '.join(lost)}"] if lost else []) + list(notes)
+    return tuple(f" {comment_text(part)}. " for part in parts)
 
 
-def plain(text: str) -> str:
+def comment_text(text: str) -> str:
     """Return text with `_` for what could end a comment in C or XML or break its line, and single hyphens."""
     return re.sub(r"-{2,}", "-", re.sub(r"[^A-Za-z0-9 _.,:;+*()=^%-]", "_", text))

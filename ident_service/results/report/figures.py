@@ -30,8 +30,8 @@ from ident_service.results.plots import (
     Axes,
     Canvas,
     draw_frame,
-    draw_key,
-    number,
+    draw_legend,
+    format_number,
     range_around,
     round_values,
 )
@@ -117,17 +117,17 @@ def _name(canvas: Canvas, name: str) -> None:
     canvas.text("ink strong", 4, 16, name if len(name) <= _LONGEST_NAME else name[: _LONGEST_NAME - 3] + "...", size=13)
 
 
-def torque_figures(evidence: Evidence, recording: int, mechanism: Chain | None = None) -> list[Figure]:
+def torque_figures(evidence: Evidence, recording_index: int, mechanism: Chain | None = None) -> list[Figure]:
     """Draw measured torque, predicted torque and residual over the recording of this index, one figure per joint."""
-    return [_torque_figure(evidence, recording, joint, mechanism) for joint in range(len(evidence.joints))]
+    return [_torque_figure(evidence, recording_index, joint, mechanism) for joint in range(len(evidence.joints))]
 
 
 def _torque_figure(evidence: Evidence, recording: int, joint: int, mechanism: Chain | None) -> Figure:
     traced = evidence.recordings[recording]
     trace, name = traced.joints[joint], evidence.joints[joint]
     unit = "N m" if evidence.revolute[joint] else "N"
-    torque = range_around(trace.torque, trace.predicted, least=1e-6)
-    residual = range_around(trace.residual, least=1e-6, zero=True)
+    torque = range_around(trace.torque, trace.predicted, least_length=1e-6)
+    residual = range_around(trace.residual, least_length=1e-6, include_zero=True)
     time = (float(traced.time[0] - 0.5 * traced.width), float(traced.time[-1] + 0.5 * traced.width))
     below = _TORQUE_TOP + _TORQUE + _TORQUE_BETWEEN
     canvas = Canvas(WIDTH, below + _RESIDUAL + _TORQUE_BOTTOM)
@@ -136,7 +136,7 @@ def _torque_figure(evidence: Evidence, recording: int, joint: int, mechanism: Ch
     key = [("area", "measured", "measured"), ("area", "predicted", "predicted"), ("area", "residual", "residual")]
     if trace.standstill.any():
         key.insert(0, ("area", "ramp", "near standstill"))
-    draw_key(canvas, WIDTH - RIGHT, 16, key)
+    draw_legend(canvas, WIDTH - RIGHT, 16, key)
     _name(canvas, name)
     shown = _Columns(traced, trace)
     _still(canvas, above, shown.edges, shown.standstill)
@@ -158,16 +158,16 @@ def _torque_figure(evidence: Evidence, recording: int, joint: int, mechanism: Ch
         canvas.circle("spike", float(under.x(spike.time)), float(under.y(spike.residual)), 4.0)
         series["spike"] = [round(spike.time, 4), spike.residual]
         if mechanism is not None:
-            said = f"{number(spike.residual)} {unit} at {number(spike.time, 4)} s"
+            said = f"{format_number(spike.residual)} {unit} at {format_number(spike.time, 4)} s"
             drawn = spike_figure(mechanism, joint, spike.time, spike.residual, spike.position, inline=True)
             posture = (f"Show the posture of the largest residual in motion, {said}", drawn)
     largest = float(np.abs(trace.residual).max())
     size = float(np.abs(trace.torque).max())
-    words = f"{name}: torque up to {number(size)} {unit}, residual up to {number(largest)} {unit}."
+    words = f"{name}: torque up to {format_number(size)} {unit}, residual up to {format_number(largest)} {unit}."
     return Figure(
         slug=f"torque-{recording + 1}-{traced.role}-{joint + 1}",
         title=f"{name}: measured and predicted torque, {traced.name}",
-        description=f"Over {number(time[1] - time[0])} s. {words}",
+        description=f"Over {format_number(time[1] - time[0])} s. {words}",
         caption=words,
         canvas=canvas,
         data={"series": series},
@@ -223,10 +223,10 @@ def friction_figures(evidence: Evidence) -> list[Figure]:
         name = evidence.joints[drive]
         torque, speed = ("N m", "rad/s") if evidence.revolute[drive] else ("N", "m/s")
         canvas = Canvas(WIDTH, _FRICTION_TOP + _FRICTION_HEIGHT + _FRICTION_BOTTOM)
-        across = range_around(friction.velocity, friction.curve_velocity, least=1e-6)
-        upright = range_around(friction.torque, friction.curve_torque, least=1e-6)
+        across = range_around(friction.velocity, friction.curve_velocity, least_length=1e-6)
+        upright = range_around(friction.torque, friction.curve_torque, least_length=1e-6)
         axes = Axes(LEFT, _FRICTION_TOP, WIDTH - LEFT - RIGHT, _FRICTION_HEIGHT, *across, *upright)
-        draw_key(canvas, WIDTH - RIGHT, 16, [("dot", "cloud", "recorded"), ("line", "second", "model")])
+        draw_legend(canvas, WIDTH - RIGHT, 16, [("dot", "cloud", "recorded"), ("line", "second", "model")])
         _name(canvas, name)
         draw_frame(canvas, axes, x=f"velocity [{speed}]", y=f"torque less rigid bodies [{torque}]")
         for x, y in zip(axes.x(friction.velocity), axes.y(friction.torque), strict=True):
@@ -240,7 +240,7 @@ def friction_figures(evidence: Evidence) -> list[Figure]:
             axes, f"velocity [{speed}]", f"friction [{torque}]", {"cloud": "recorded", "second": "model"}
         )
         words = f"{name}: {len(friction.velocity)} points, off the curve by "
-        words += f"{number(friction_scatter(evidence, drive))} {torque} rms."
+        words += f"{format_number(friction_scatter(evidence, drive))} {torque} rms."
         figures.append(
             Figure(
                 slug=f"friction-{drive + 1}",
@@ -280,12 +280,18 @@ def _residual_figure(evidence: Evidence, joint: int, shown: list[PredictionTrace
     wide = WIDTH - LEFT - RIGHT
     kinds = ["first" if one.role == "identification" else "second" for one in shown]
     key = [("line", kind, one.role) for kind, one in zip(kinds, shown, strict=True)]
-    draw_key(canvas, WIDTH - RIGHT, 16, key)
+    draw_legend(canvas, WIDTH - RIGHT, 16, key)
     _name(canvas, name)
     low, high = (extreme(float(extreme(s.frequency)) for s in spectra) for extreme in (min, max))
     densities = [_log(spectrum) for spectrum in spectra]
     above = Axes(
-        LEFT, _RESIDUAL_TOP, wide, _RESIDUAL_HEIGHT, np.log10(low), np.log10(high), *range_around(*densities, least=1.0)
+        LEFT,
+        _RESIDUAL_TOP,
+        wide,
+        _RESIDUAL_HEIGHT,
+        np.log10(low),
+        np.log10(high),
+        *range_around(*densities, least_length=1.0),
     )
     across, upright = "frequency [Hz]", f"density of the residual [{unit}]"
     draw_frame(canvas, above, x=across, y=upright, x_log=True, y_log=True)
@@ -323,15 +329,15 @@ def _log(spectrum: Spectrum) -> Array:
 
 def _strongest(spectrum: Spectrum) -> str:
     at = spectrum.frequency[int(np.argmax(spectrum.density))]
-    return f"largest at {number(float(at))} Hz"
+    return f"largest at {format_number(float(at))} Hz"
 
 
 def _memory(spectrum: Spectrum) -> str:
     """Describe the correlation time of the residual, where its autocorrelation falls below 1/e."""
     small = np.flatnonzero(np.abs(spectrum.correlation) < np.exp(-1.0))
     if not len(small):
-        return f"and it resembles itself for more than {number(float(spectrum.lag[-1]))} s"
-    return f"and it resembles itself for {number(1e3 * float(spectrum.lag[small[0]]))} ms"
+        return f"and it resembles itself for more than {format_number(float(spectrum.lag[-1]))} s"
+    return f"and it resembles itself for {format_number(1e3 * float(spectrum.lag[small[0]]))} ms"
 
 
 _TIMING_TOP, _TIMING_HEIGHT, _TIMING_BOTTOM = 28.0, 150.0, 40.0
@@ -380,36 +386,35 @@ def _timing_figure(place: int, timing: Timing, deviation: float | None) -> Figur
         slug=f"timing-{place}",
         title=f"Timing of {timing.recording}",
         description=words,
-        caption=f"{words} The period is {number(scale / timing.rate)} {unit}.",
+        caption=f"{words} The period is {format_number(scale / timing.rate)} {unit}.",
         canvas=canvas,
         data={"values": [bars]},
     )
 
 
-def timing_words(timing: Timing, deviation: float | None = None) -> str:
+def timing_words(timing: Timing, step_deviation: float | None = None) -> str:
     """Summarise a recording's timing in words.
 
     Args:
         timing: of the recording.
-        deviation: standard deviation of its steps from the usual one [s]; None where it is not known.
+        step_deviation: standard deviation of its steps from the usual one [s]; None where it is not known.
     """
-    worst = f"{number(1e3 * timing.largest)} ms"
-    words = f"{timing.recording}: {timing.samples} samples at {number(timing.rate, 5)} Hz; "
+    worst = f"{format_number(1e3 * timing.largest)} ms"
+    words = f"{timing.recording}: {timing.samples} samples at {format_number(timing.rate, 5)} Hz; "
     if timing.source == "cycle":
         words += f"the latest cycle began {worst} late"
-        words += f", the longest computed {number(1e3 * timing.compute)} ms." if timing.compute is not None else "."
+        words += "." if timing.compute is None else f", the longest computed {format_number(1e3 * timing.compute)} ms."
     else:
         words += (
-            f"the most uneven step is {worst} off ({number(100 * timing.largest * timing.rate, 2)} % of a period)"
-            f"{_typical(timing, deviation)}. The recording has no account of its cycles, so this is from its "
+            f"the most uneven step is {worst} off ({format_number(100 * timing.largest * timing.rate, 2)} % of a "
+            f"period){_typical(timing, step_deviation)}. The recording has no account of its cycles, so this is from "
         )
-        words += "stamps, and what was lost on the bus or did not answer is not known."
+        words += "its stamps, and what was lost on the bus or did not answer is not known."
     if timing.gap_count:
         start, length = timing.gaps[0]
         count = "one gap" if timing.gap_count == 1 else f"{timing.gap_count} gaps"
-        words += (
-            f" {count[0].upper()}{count[1:]}, the longest {number(length)} s, {number(start, 4)} s after the start."
-        )
+        words += f" {count[0].upper()}{count[1:]}, the longest {format_number(length)} s, "
+        words += f"{format_number(start, 4)} s after the start."
     else:
         words += " No gaps."
     if timing.lost is not None:
@@ -422,7 +427,7 @@ def timing_words(timing: Timing, deviation: float | None = None) -> str:
 def _typical(timing: Timing, deviation: float | None) -> str:
     if deviation is None:
         return ""
-    return f"; their standard deviation is {number(100 * deviation * timing.rate, 2)} % of a period"
+    return f"; their standard deviation is {format_number(100 * deviation * timing.rate, 2)} % of a period"
 
 
 _UNCERTAINTY_TOP, _UNCERTAINTY_HEIGHT, _UNCERTAINTY_BOTTOM = 42.0, 220.0, 40.0
@@ -483,7 +488,7 @@ def deviation_figure(parameters: ParameterFile) -> Figure | None:
         np.log10(low) - 0.1,
         np.log10(high) + 0.1,
     )
-    draw_key(
+    draw_legend(
         canvas, WIDTH - RIGHT, 16, [("dot" if kind == "good" else "area", kind, word) for word, kind in _KINDS.items()]
     )
     draw_frame(canvas, axes, x="number of the base parameter, as in the table", y="relative deviation", y_log=True)
@@ -495,7 +500,7 @@ def deviation_figure(parameters: ParameterFile) -> Figure | None:
         kind = _KINDS.get(verdicts[place] if place < len(verdicts) else "", "good")
         # Shape repeats what colour shows: a ring would not be seen at this size, but a square is.
         x, y = float(axes.x(place + 1)), float(axes.y(shown[place]))
-        share = "not excited" if np.isnan(shares[place]) else f"{number(100.0 * shares[place])} %"
+        share = "not excited" if np.isnan(shares[place]) else f"{format_number(100.0 * shares[place])} %"
         hint = f"{place + 1}: {table['expressions'][place]}: {share}"
         if kind == "good":
             canvas.circle(kind, x, y, 3.4, hint)
@@ -525,7 +530,7 @@ def correlation_figure(parameters: ParameterFile) -> Figure | None:
     margin = 0.62 * letters * max(map(len, names)) + 10.0
     side, top = cell * size, 26.0
     canvas = Canvas(max(margin + side + RIGHT, 340.0), top + side + margin)
-    draw_key(canvas, 330.0, 16, [("area", "plus", "together"), ("area", "minus", "against each other")])
+    draw_legend(canvas, 330.0, 16, [("area", "plus", "together"), ("area", "minus", "against each other")])
     shown = np.nan_to_num(correlation)
     levels = np.ceil(np.abs(shown) * 5.0) * np.sign(shown)
     levels[np.abs(shown) < _LEAST_SHOWN] = 0
@@ -547,7 +552,11 @@ def correlation_figure(parameters: ParameterFile) -> Figure | None:
         top + np.array([0.0, side, side, 0.0]),
     )
     pairs = strongest_pairs(correlation)
-    words = "Strongest: " + ", ".join(f"{names[i]} with {names[j]}: {number(value, 2)}" for i, j, value in pairs) + "."
+    words = (
+        "Strongest: "
+        + ", ".join(f"{names[i]} with {names[j]}: {format_number(value, 2)}" for i, j, value in pairs)
+        + "."
+    )
     rows, columns = np.tril_indices(size, -1)
     hundredths = np.round(100.0 * shown[rows, columns]).astype(np.int8)
     return Figure(
@@ -659,7 +668,7 @@ def _bodies_figure(joints: tuple[str, ...], posed: PosedArm, name: str, view: tu
     canvas = Canvas(WIDTH, _BODIES_TOP + height + _BODIES_BOTTOM)
     axes = Axes(LEFT, _BODIES_TOP, side, height, *(middle[0] + [-half[0], half[0]]), *(middle[1] + [-half[1], half[1]]))
     _frame(canvas, axes, view)
-    draw_key(canvas, WIDTH - RIGHT, 16, [("area", "body", "link's body"), ("dot", "dot", "centre of mass")])
+    draw_legend(canvas, WIDTH - RIGHT, 16, [("area", "body", "link's body"), ("dot", "dot", "centre of mass")])
     for outline in outlines:
         if outline is not None:
             canvas.polygon("body", axes.x(outline[:, 0]), axes.y(outline[:, 1]))
@@ -704,11 +713,11 @@ def _frame(canvas: Canvas, axes: Axes, view: tuple[int, int]) -> None:
     for value in values:
         at = float(axes.x(value))
         canvas.line("grid", at, axes.top, at, axes.top + axes.height)
-        canvas.text("soft", at, axes.top + axes.height + 15, number(value, 6), size=FONT, anchor="middle")
+        canvas.text("soft", at, axes.top + axes.height + 15, format_number(value, 6), size=FONT, anchor="middle")
     for value in step * np.arange(np.ceil(axes.low_y / step), np.floor(axes.high_y / step) + 1):
         at = float(axes.y(value))
         canvas.line("grid", axes.left, at, axes.left + axes.width, at)
-        canvas.text("soft", axes.left - 5, at + 4, number(float(value), 6), size=FONT, anchor="end")
+        canvas.text("soft", axes.left - 5, at + 4, format_number(float(value), 6), size=FONT, anchor="end")
     canvas.rectangle("frame", axes.left, axes.top, axes.width, axes.height)
     across, up = (f"{_NAMES[axis]} [m]" for axis in view)
     middle = axes.left + axes.width / 2
@@ -723,19 +732,21 @@ def _length(axes: Array) -> float:
 
 def _words(joints: tuple[str, ...], posed: PosedArm, shown: _Shown) -> str:
     longest = shown.longest
-    masses = ", ".join(f"{name} {number(body.mass)} kg" for name, body in zip(joints, posed.bodies, strict=True))
+    masses = ", ".join(f"{name} {format_number(body.mass)} kg" for name, body in zip(joints, posed.bodies, strict=True))
     words = f"Masses, one feasible choice of many: {masses}."
     if gone := [name for name, body in zip(joints, posed.bodies, strict=True) if body.axes is None]:
         words += f" No mass distribution has the inertia of {', '.join(gone)}; only the centre is drawn."
     lengths = [0.0 if body.axes is None else _length(body.axes) for body in posed.bodies]
-    if large := [f"{name} ({number(size)} m)" for name, size in zip(joints, lengths, strict=True) if size > longest]:
+    if large := [
+        f"{name} ({format_number(size)} m)" for name, size in zip(joints, lengths, strict=True) if size > longest
+    ]:
         words += (
-            f" Longer than {number(longest)} m and not drawn: the ellipsoid of {', '.join(large)}. "
+            f" Longer than {format_number(longest)} m and not drawn: the ellipsoid of {', '.join(large)}. "
             "It is one body of many with the same dynamics; --prior moves the choice towards known bodies."
         )
     tiny = _SMALLEST * longest
     if small := [name for name, size in zip(joints, lengths, strict=True) if 0.0 < size < tiny]:
-        words += f" Too small to be seen (shorter than {number(tiny)} m): the ellipsoid of {', '.join(small)}."
+        words += f" Too small to be seen (shorter than {format_number(tiny)} m): the ellipsoid of {', '.join(small)}."
     far = [
         name
         for name, body, placed in zip(joints, posed.bodies, shown.placed, strict=True)

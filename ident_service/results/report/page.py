@@ -20,7 +20,7 @@ from ident_service.results.evidence.evidence import Array, Condition, Evidence, 
 from ident_service.results.evidence.file import packed, packed_mask, runs_of
 from ident_service.results.evidence.gathering import CAD
 from ident_service.results.parameter_file import ParameterFile
-from ident_service.results.plots import number
+from ident_service.results.plots import format_number
 from ident_service.results.report.figures import (
     GOOD,
     Figure,
@@ -39,16 +39,16 @@ _WORDS: dict[Word, str] = {"use": "", "use with care": "weak", "do not use": "ba
 _JOINTS = 8  # rows of the table on top before others are folded
 
 
-def assessment_table(found: Assessment) -> Table | None:
+def assessment_table(assessment: Assessment) -> Table | None:
     """Return the report's first table, each joint's torque errors and verdict; None where the file has no errors."""
-    if not found.joints:
+    if not assessment.joints:
         return None
-    unseen = any(one.unseen is not None for one in found.joints)
+    unseen = any(one.unseen is not None for one in assessment.joints)
     heads = ["joint", "verdict", "fitted [%]", "fitted, moving [%]"]
     heads += ["unseen [%]", "unseen, moving [%]"] if unseen else []
     heads += ["residual rms", "torque rms"]
     rows = []
-    for one in found.joints:
+    for one in assessment.joints:
         kind = _WORDS[one.word]
         errors = [one.fitted, one.fitted_moving, *([one.unseen, one.unseen_moving] if unseen else [])]
         cells = [Cell(one.joint), Cell(one.word, kind=kind), *(_number(value, 3) for value in errors)]
@@ -57,7 +57,7 @@ def assessment_table(found: Assessment) -> Table | None:
 
 
 def _quantity(value: float | None, unit: str) -> Cell:
-    return _NOTHING if value is None else Cell(f"{number(value)} {unit}".strip(), value)
+    return _NOTHING if value is None else Cell(f"{format_number(value)} {unit}".strip(), value)
 
 
 def joint_rule() -> str:
@@ -99,7 +99,9 @@ def parameter_table(evidence: Evidence, parameters: ParameterFile) -> Table:
         cells += [_number(float(values[k])) for _, values in others]
         if intervals:
             ends = [end for end in intervals[k] if end is not None]
-            cells.append(Cell(f"{number(ends[0], 3)} to {number(ends[1], 3)}") if len(ends) == 2 else _NOTHING)
+            cells.append(
+                Cell(f"{format_number(ends[0], 3)} to {format_number(ends[1], 3)}") if len(ends) == 2 else _NOTHING
+            )
         if any(evidence.bounds):
             cells.append(Cell("; ".join(evidence.bounds[k]) or "\u2014"))
         rows.append(cells)
@@ -185,16 +187,20 @@ def _tightest(conditions: list[Condition]) -> list[Cell]:
         return [Cell("no condition"), _NOTHING, _NOTHING]
     least = min(conditions, key=lambda one: one.scaled)
     kind = "bad" if least.scaled <= 0.0 else ""
-    return [Cell(least.name), Cell(number(least.margin), least.margin, kind), Cell(number(least.scaled), least.scaled)]
+    return [
+        Cell(least.name),
+        Cell(format_number(least.margin), least.margin, kind),
+        Cell(format_number(least.scaled), least.scaled),
+    ]
 
 
-def friction_table(evidence: Evidence, parameters: ParameterFile, order: Sequence[int]) -> Table:
+def friction_table(evidence: Evidence, parameters: ParameterFile, joint_order: Sequence[int]) -> Table:
     """Return, per joint, how far friction lies off its curve, and the shape parameters that the curve has.
 
     Args:
         evidence: evidence with friction.
         parameters: parameter file of the same estimate.
-        order: numbers of the joints, the worst first.
+        joint_order: numbers of the joints, the worst first.
     """
     found = parameters.content.get("friction", {})
     kinds = (
@@ -204,7 +210,7 @@ def friction_table(evidence: Evidence, parameters: ParameterFile, order: Sequenc
     shown = [(*kind, found[kind[1]]) for kind in kinds if any(found.get(kind[1], []))]
     shown = [one for one in shown if len(one[-1]) == len(evidence.joints)]
     rows = []
-    for k in order:
+    for k in joint_order:
         turns = evidence.revolute[k]
         cells = [Cell(evidence.joints[k]), _quantity(friction_scatter(evidence, k), "N m" if turns else "N")]
         cells += [_quantity(values[k], unit if turns else other) for _, _, unit, other, values in shown]
@@ -245,7 +251,7 @@ def file_table(evidence: Evidence, parameters: ParameterFile, sha256: Mapping[st
 def _number(value: float | None, digits: int = 5) -> Cell:
     if value is None:
         return _NOTHING
-    words = number(value, digits)
+    words = format_number(value, digits)
     return Cell(words, float(value)) if np.isfinite(value) else _NOTHING
 
 
@@ -389,18 +395,21 @@ def _run(parameters: ParameterFile) -> list[str]:
     origin, fit = parameters.content.get("provenance", {}), parameters.content.get("fit")
     rows = [f"Method {parameters.content.get('method', '?')}, feasible set {parameters.feasible_set or '?'}."]
     if fit is not None:
-        condition = "infinite" if fit["condition_number"] is None else number(fit["condition_number"])
+        condition = "infinite" if fit["condition_number"] is None else format_number(fit["condition_number"])
         rows.append(f"{fit['samples']} samples; condition number of the regressor {condition}.")
     delay = parameters.content.get("torque_delay", {}).get("deviation")
     if delay is not None:
         seconds = 1e3 * parameters.content["torque_delay"]["seconds"]
-        rows.append(f"Torque is stamped {number(seconds)} \u00b1 {number(1e3 * delay)} ms later than the position.")
+        rows.append(
+            f"Torque is stamped {format_number(seconds)} \u00b1 "
+            f"{format_number(1e3 * delay)} ms later than the position."
+        )
     scales = parameters.content.get("torque_scales", [])
     if any(scale != 1.0 for scale in scales):
-        rows.append("Measured torques multiplied by " + ", ".join(number(scale, 4) for scale in scales) + ".")
+        rows.append("Measured torques multiplied by " + ", ".join(format_number(scale, 4) for scale in scales) + ".")
     for one in parameters.content.get("torque_constants", []):
         doubt = one["standard_deviation"]
-        told = "not shown" if doubt is None else f"{number(one['factor'], 4)} \u00b1 {number(doubt)}"
+        told = "not shown" if doubt is None else f"{format_number(one['factor'], 4)} \u00b1 {format_number(doubt)}"
         rows.append(f"Torque of motor {one['motor']} ({', '.join(one['joints'])}) for one by its description: {told}.")
     rows.append(f"Made {origin.get('created', 'at an unknown time')} by {origin.get('software', 'unknown software')}")
     rows[-1] += f", commit {origin['git']}." if origin.get("git") else "."

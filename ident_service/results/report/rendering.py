@@ -14,7 +14,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from ident_service.results.plots import printable, sheet
+from ident_service.results.plots import css_style_sheet, printable
 from ident_service.results.report.figures import Figure
 
 WORST = 3  # rows of a table, or figures of a section, that are shown before the others are unfolded
@@ -93,7 +93,7 @@ def render(template: str, scripts: Sequence[str] = (), styles: Sequence[str] = (
         .get_template(template)
         .render(
             policy=Markup(policy),  # noqa: S704
-            style=Markup("".join([*styles, asset("report.css"), sheet()])),  # noqa: S704
+            style=Markup("".join([*styles, asset("report.css"), css_style_sheet()])),  # noqa: S704
             scripts=[Markup(script) for script in scripts],  # noqa: S704
             **values,
         )
@@ -101,9 +101,9 @@ def render(template: str, scripts: Sequence[str] = (), styles: Sequence[str] = (
 
 
 @cache
-def asset(name: str) -> str:
+def asset(file_name: str) -> str:
     """Return the text of a file of this package."""
-    return files(str(__package__)).joinpath(name).read_text(encoding="utf-8")
+    return files(str(__package__)).joinpath(file_name).read_text(encoding="utf-8")
 
 
 @cache

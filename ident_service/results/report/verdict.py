@@ -17,7 +17,7 @@ from ident_service.results.assessment import (
 )
 from ident_service.results.evidence.evidence import Evidence
 from ident_service.results.parameter_file import ParameterFile
-from ident_service.results.plots import number, shortened
+from ident_service.results.plots import format_number, shortened
 from ident_service.results.report.figures import relative_deviations
 
 ILL_CONDITIONED = 1000.0  # condition number of the regressor, SI units
@@ -46,7 +46,7 @@ def active_constraints_text(evidence: Evidence, parameters: ParameterFile) -> st
     return f"{len(tight)}{of} constraints are active" if len(tight) > 1 else f"1{of} constraint is active"
 
 
-def listed(names: Sequence[str]) -> str:
+def join_first_names(names: Sequence[str]) -> str:
     """Join the first few names, shortened, and say how many more there are."""
     shown = [shortened(name, _LONGEST) for name in names[:NAMED]]
     more = len(names) - len(shown)
@@ -87,9 +87,9 @@ def _feasibility(evidence: Evidence, parameters: ParameterFile) -> list[str]:
     found = parameters.content.get("feasibility")
     if found is None:
         return ["Physical feasibility was not tested."]
-    margin, kind = number(found["margin"]), found.get("certificate", {}).get("kind", "")
+    margin, kind = format_number(found["margin"]), found.get("certificate", {}).get("kind", "")
     certified = kind in ("witness", "dual")
-    tight = listed(found.get("tight", []))
+    tight = join_first_names(found.get("tight", []))
     if parameters.feasible_set == "none":
         how = "They were estimated without a feasible set."
     else:
@@ -130,11 +130,13 @@ def _prediction(evidence: Evidence, parameters: ParameterFile) -> str:
     if own.moving is None or own.identification is None:
         return f"{words}."
     times = max(own.validation) / max(own.identification, 1e-12)
-    return f"{words}{f' (over all rows, {number(times, 2)} times its own error)' if times > MUCH_WORSE else ''}."
+    return f"{words}{f' (over all rows, {format_number(times, 2)} times its own error)' if times > MUCH_WORSE else ''}."
 
 
 def _error(whole: float, moving: float | None) -> str:
-    return f"{number(whole)} %" + ("" if moving is None else f" ({number(moving)} % away from standstill)")
+    return f"{format_number(whole)} %" + (
+        "" if moving is None else f" ({format_number(moving)} % away from standstill)"
+    )
 
 
 def _knowledge(parameters: ParameterFile) -> str:
@@ -150,7 +152,7 @@ def _knowledge(parameters: ParameterFile) -> str:
     if not unknown:
         return words + "."
     shown = "; ".join(
-        f"{shortened(name, _LONGEST)} ({'not seen' if np.isinf(share) else number(share, 2)})"
+        f"{shortened(name, _LONGEST)} ({'not seen' if np.isinf(share) else format_number(share, 2)})"
         for name, share in unknown[:NAMED]
     )
     more = f"; and {len(unknown) - NAMED} more" if len(unknown) > NAMED else ""
@@ -163,7 +165,7 @@ def _condition_number(parameters: ParameterFile) -> list[str]:
     # A large number by itself is no limitation: it depends on units, and parameters may be identified in spite of it.
     if fit is None or "unidentified" not in verdicts or (fit["condition_number"] or np.inf) <= ILL_CONDITIONED:
         return []
-    size = "infinite" if fit["condition_number"] is None else number(fit["condition_number"])
+    size = "infinite" if fit["condition_number"] is None else format_number(fit["condition_number"])
     return [
         f"The regressor's condition number is {size}, above {ILL_CONDITIONED:g}: "
         "some combinations of parameters are hardly excited."
