@@ -16,15 +16,15 @@ import pytest
 from design_bench import quick, small
 
 from ident_service.errors import UsageError
-from ident_service.excitation.design import complete_task, design_motion, family, safe_posture
+from ident_service.excitation.design import complete_task, design_motion, motion_family, safe_posture
 from ident_service.excitation.optimal_design import Problem
 from ident_service.excitation.search import (
     Budget,
     Progress,
     SearchResult,
-    found_to_json,
-    read_found,
+    read_search,
     search,
+    search_to_json,
     within_limits,
 )
 
@@ -33,7 +33,7 @@ GRID = 60
 
 def bench() -> tuple[Any, np.ndarray]:
     model, design = small(), quick()
-    task = complete_task(model, design, *family(design, model))
+    task = complete_task(model, design, *motion_family(design, model))
     return task, safe_posture(model, task.limits)
 
 
@@ -114,12 +114,12 @@ def test_a_search_goes_on_where_it_ended() -> None:
 def test_a_search_with_another_guess_of_friction_is_another_search(tmp_path: Path) -> None:
     """Its candidates follow otherwise, so that what it found may not follow at all."""
     model, design = small(), quick(friction_guess=(0.1, 0.05))
-    other = complete_task(model, design, *family(design, model))
+    other = complete_task(model, design, *motion_family(design, model))
     file = tmp_path / "search.json"
-    file.write_text(found_to_json(starts(0), TASK))
-    assert read_found(file, TASK, 5).seed == 5
+    file.write_text(search_to_json(starts(0), TASK))
+    assert read_search(file, TASK, 5).seed == 5
     with pytest.raises(UsageError, match="another arm, criterion, margin, friction"):
-        read_found(file, other, 5)
+        read_search(file, other, 5)
 
 
 def test_going_on_without_another_start_never_makes_the_best_worse() -> None:
