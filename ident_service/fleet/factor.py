@@ -489,7 +489,7 @@ def _reduced(recording: Recording, key: str, label: str, described: Described) -
     seen = _require_usable(recording, model)
     gathered = equations(recording, model, base)
     shares = standstill_weights(gathered)
-    fitted = gathered.with_near(shares)
+    fitted = gathered.with_standstill_rows(shares)
     method = model.config.identification.method
     fit: LeastSquares = (ordinary_least_squares if method == "ols" else weighted_least_squares)(fitted.total)
     if method == "huber":

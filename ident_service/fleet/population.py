@@ -52,9 +52,9 @@ from ident_service.estimation.least_squares import (
 from ident_service.estimation.uncertainty import (
     Uncertainty,
     negligible,
+    student_factors,
     uncertainty,
     verdicts,
-    widening,
 )
 from ident_service.fleet.factor import Described, Merged, Row
 from ident_service.model.blas_threads import one_blas_thread
@@ -384,7 +384,7 @@ def arm_estimate(
     fit = alone.fit if drawn is None else drawn
     held = constrained_least_squares(fit, base, conditions)
     degrees = alone.doubt.degrees if drawn is None else np.full(base.size, max(arms - 2.0, 1.0))
-    deviations = alone.doubt.deviations if drawn is None else drawn.standard_deviations * widening(degrees)
+    deviations = alone.doubt.deviations if drawn is None else drawn.standard_deviations * student_factors(degrees)
     covariance = alone.doubt.covariance if drawn is None else drawn.inverse @ drawn.inverse.T
     likely = likely_bodies(model)
     near = allowed_change(fit, base, deviations, held.beta) if held.tight and drawn is None else None
@@ -489,7 +489,7 @@ def unlike(
             only = np.zeros(len(mean))
             seen = [k for k in places if np.isfinite(own_covariance[k, k])]
             only[seen] = (own.values - others.values)[seen]
-            change = motion.change(only)
+            change = motion.torque_change(only)
             share = change / np.maximum(motion.torque, np.finfo(float).tiny)
             joint = int(np.argmax(share))
             every.append(Unlike(arm, group, test, 1.0, float(change[joint]), joint, float(share[joint])))

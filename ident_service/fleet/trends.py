@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import ndtr
 
-from ident_service.estimation.change_detection import ALPHA, Kind, Motion, holm, probability, relevant
+from ident_service.estimation.change_detection import ALPHA, Kind, Motion, holm, p_value, relevant
 from ident_service.fleet.factor import CONDITIONS, Described
 from ident_service.fleet.population import ArmFit, Population, Unlike, unlike
 from ident_service.fleet.reduction import Recorded
@@ -195,7 +195,7 @@ def change_points(
             p, statistic, drift, at, step, deviations, times = found
             only = np.zeros(len(fits[arm].fit.beta))
             only[list(places)] = step
-            change, tiny = motion.change(only), np.finfo(float).tiny
+            change, tiny = motion.torque_change(only), np.finfo(float).tiny
             shares = change / np.maximum(motion.torque, tiny), change / np.maximum(motion.residual, tiny)
             joint = int(np.argmax(shares[0]))
             of_joint = (float(shares[0][joint]), float(shares[1][joint]))
@@ -253,7 +253,7 @@ def _most_likely(
     best = int(np.argmax(every))
     statistic, drift = float(every[best] / inflation[best]), best == len(splits)
     split = count // 2 if drift else int(splits[best])
-    p = min(probability(statistic, size, max(float(degrees[best]), size)) * len(shapes), 1.0)
+    p = min(p_value(statistic, size, max(float(degrees[best]), size)) * len(shapes), 1.0)
     times = (float(at[0]), float(at[-1])) if drift else (float(at[split - 1]), float(at[split]))
     return p, statistic, drift, seen[split], np.concatenate(steps)[best], np.concatenate(deviations)[best], times
 

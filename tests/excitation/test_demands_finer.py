@@ -166,7 +166,7 @@ def test_torque_and_power_lie_inside_their_enclosures_stretch_by_stretch(seed: i
     assert model.config.supply is not None
     rng = np.random.default_rng(seed)
     # Long stretches too: then the enclosures have to do with more than rounding.
-    cells = time_intervals(path, float(rng.choice([0.01, 0.005, 0.0025])) / path.fastest(0.0, path.duration))
+    cells = time_intervals(path, float(rng.choice([0.01, 0.005, 0.0025])) / path.highest_frequency(0.0, path.duration))
     enclosed = torque_enclosures(cells, model, model.prior)
     drawn = power_bounds(enclosed, cells.enclosures(1), model.config.supply, model.chain.coupling)
     picked = rng.choice(len(cells.time), size=min(20, len(cells.time)), replace=False)
