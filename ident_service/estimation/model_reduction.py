@@ -101,7 +101,7 @@ def essential_parameters(
     if fit.rank < size:
         raise ModelError(f"the data excite {fit.rank} of {size} directions; record a motion that excites all of them")
     if not 0.0 < significance_level < 1.0:
-        raise ModelError(f"{significance_level=} is no level of a test")
+        raise ModelError(f"level={significance_level!r} is no level of a test")
     covariance = block_covariance(equations, fit) if covariance is None else covariance
     from scipy.special import fdtri  # loads for 0.2 s, and few ask for essential parameters
 

@@ -133,7 +133,7 @@ def cases(torque_margin: float) -> tuple[Case, ...]:
 
 
 def track(path: MotionPath, model: ArmModel, torque_margin: float) -> Tracking:
-    """Simulate the arm over a motion with less friction, and with more and heavier links; return errors and speeds.
+    """Simulate the arm on a motion with friction times 0.6, and 1.4 with heavier links; return errors and speeds.
 
     Of a periodic motion both ramps and one period are simulated, which the others repeat.
 

@@ -148,7 +148,7 @@ def symmetric(entries: Array, size: int) -> Array:
 def matrix_block(
     name: str, rows: list[list[Row]], reference_scales: tuple[float, ...], parameter_index: dict[str, int]
 ) -> Block:
-    """Build the condition that a matrix with entries linear in the link parameters is positive semidefinite."""
+    """Build the condition that a matrix, linear in link parameters (upper triangle read), is positive semidefinite."""
     size = len(rows)
     F = np.zeros((size * (size + 1) // 2, len(parameter_index)))
     for entry, (i, j) in enumerate(triangle_entries(size)):
