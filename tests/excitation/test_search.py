@@ -98,7 +98,7 @@ def test_candidates_keep_all_limits_and_the_best_comes_first() -> None:
 @pytest.mark.slow
 def test_a_search_goes_on_where_it_ended() -> None:
     first, _ = searched(1)
-    all_three = starts(2, earlier=first)
+    all_three = starts(2, earlier_search=first)
     assert all_three.finished == 3
     assert {candidate.start for candidate in all_three.candidates} == {0, 1, 2}
     assert all_three.candidates[0].value <= first.candidates[0].value
@@ -125,7 +125,7 @@ def test_a_search_with_another_guess_of_friction_is_another_search(tmp_path: Pat
 def test_going_on_without_another_start_never_makes_the_best_worse() -> None:
     found, _ = searched(1)
     for _ in range(3):
-        again = starts(0, earlier=found)
+        again = starts(0, earlier_search=found)
         assert again.candidates[0].value <= found.candidates[0].value
         found = again
 
@@ -216,7 +216,7 @@ def test_a_budget_too_short_for_a_single_climb_still_has_a_candidate() -> None:
 
 
 def test_time_spent_is_added_up() -> None:
-    found = starts(0, earlier=SearchResult(5, 3, 100.0, ()), clock=ticking())
+    found = starts(0, earlier_search=SearchResult(5, 3, 100.0, ()), clock=ticking())
     assert found.finished == 3
     assert 100.0 < found.seconds < 100.1
 
