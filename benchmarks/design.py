@@ -28,7 +28,7 @@ from ident_service.config.motion_design import Criterion
 from ident_service.config.motion_limits import motion_limits
 from ident_service.estimation.identify import identify
 from ident_service.excitation.described_motion import excitation
-from ident_service.excitation.design import Designed, complete_task, design_motion, family
+from ident_service.excitation.design import Designed, complete_task, design_motion, motion_family
 from ident_service.excitation.limit_proof import violations
 from ident_service.excitation.motion_file import Excitation
 from ident_service.excitation.optimal_design import Problem, usable_limits
@@ -80,7 +80,7 @@ def _evaluation(model: ArmModel) -> list[Row]:
     rows = []
     for criterion in ("condition_number", "d_optimal"):
         design = model.config.design.model_copy(update={"criterion": criterion, "position_margin": 0.15, "ramp": 0.0})
-        basis, base = family(design, model)
+        basis, base = motion_family(design, model)
         problem = Problem(complete_task(model, design, basis, base), 500)
         x = 0.3 * np.random.default_rng(0).normal(size=problem.size)
         multipliers = problem.no_multipliers(1.0)

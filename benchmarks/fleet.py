@@ -39,8 +39,8 @@ from ident_service.fleet.factor import (
     reduce_recording,
 )
 from ident_service.fleet.identify import identify_fleet
-from ident_service.fleet.reduction import FleetRequest, connected, results_as_completed
-from ident_service.fleet.storage import Store, find
+from ident_service.fleet.reduction import FleetRequest, dask_client, results_as_completed
+from ident_service.fleet.storage import Store, find_files
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
@@ -105,7 +105,7 @@ def _tell(begin: float) -> Any:
 def cost(folder: Path, place: Path, described: Described) -> float:
     """Return CPU seconds a recording, in this process, which a loaded machine changes least."""
     store = Store(str(place / "cost"))
-    parts = [Part(source) for source in find([f"{folder}/arm00/*.mcap"])]
+    parts = [Part(source) for source in find_files([f"{folder}/arm00/*.mcap"])]
     reduce_recording(parts[0], described, store, __version__)
     begin = time.process_time()
     for part in parts[1:]:
@@ -114,7 +114,7 @@ def cost(folder: Path, place: Path, described: Described) -> float:
 
 
 def _reduced(folder: str, arm: int, described: Described, store: str) -> None:
-    for source in find([f"{folder}/arm{arm:02}/week[0-{EACH - 1}].mcap"]):
+    for source in find_files([f"{folder}/arm{arm:02}/week[0-{EACH - 1}].mcap"]):
         reduce_recording(Part(source), described, Store(store), __version__)
 
 
@@ -137,9 +137,9 @@ def memory(folder: Path, place: Path, described: Described) -> float:
     """Return the largest resident memory of a worker while it reduces recordings [MiB]."""
     request = FleetRequest(ARM, (f"{folder}/arm00/*.mcap",), str(place / "memory"), workers=1)
     store, largest = Store(request.store), 0.0
-    with connected(request, lambda _: None) as client:
+    with dask_client(request, lambda _: None) as client:
         (pid,) = client.run(os.getpid).values()
-        for source in find(request.patterns):
+        for source in find_files(request.patterns):
             future = client.submit(reduce_recording, Part(source), described, store, __version__, pure=False)
             while not future.done():
                 largest = max(largest, psutil.Process(pid).memory_info().rss / 2**20)
@@ -161,7 +161,7 @@ def merging(store: Store, result: Any) -> tuple[float, float]:
         size = float(factor.stat().st_size)
         (place / f"{number:05}.npz").hardlink_to(factor)
     request = FleetRequest(ARM, (), many.url, workers=2)
-    with connected(request, lambda _: None) as client:
+    with dask_client(request, lambda _: None) as client:
         begin = time.perf_counter()
         keys = [f"{number:05}" for number in range(STORED)]
         level = [
@@ -221,7 +221,7 @@ def measure(folder: Path, place: Path, arms: int) -> Iterator[Row]:
     yield Row(f"merge of {STORED} stored factors", merged, "s", "<= 60")
     yield Row("CPU of that merge, with starting workers", spent() - before, "s")
     yield Row("one factor", size / 1024.0, "KiB")
-    with connected(FleetRequest(ARM, (), store, workers=2), lambda _: None) as client:
+    with dask_client(FleetRequest(ARM, (), store, workers=2), lambda _: None) as client:
         yield Row(f"scheduler, per task of {TASKS}", 1e3 * overhead(client), "ms")
     yield Row("load of the machine after", os.getloadavg()[0], "")
 

@@ -76,7 +76,7 @@ def bootstrap(
     seed: int = 0,
     solve: Solve | None = None,
     *,
-    run: int | None = None,
+    blocks_per_run: int | None = None,
     level: float = 0.95,
     progress: Progress = lambda _done, _all: None,
 ) -> Bootstrap:
@@ -91,7 +91,7 @@ def bootstrap(
         seed: of the draws; the same seed gives the same replicates.
         solve: function from a replicate's least squares to base parameters of shape (base,); the constrained least
             squares (eq. 74) over `conditions` when None.
-        run: consecutive blocks drawn together; `run_length` says how many when None.
+        blocks_per_run: consecutive blocks drawn together; `run_length` says how many when None.
         level: share of the replicates inside the intervals, between 0 and 1.
         progress: called after each replicate with how many are done, and how many there will be.
 
@@ -104,7 +104,7 @@ def bootstrap(
     count = len(equations.blocks)
     if count < 2 or replicates < 2:
         raise ModelError(f"{count} blocks and {replicates} replicates; a bootstrap needs two of each, and better many")
-    length = run_length(equations, fit) if run is None else run
+    length = run_length(equations, fit) if blocks_per_run is None else blocks_per_run
     if not 1 <= length <= count or not 0.0 < level < 1.0:
         raise ModelError(f"runs of {length} blocks out of {count}, intervals at {level:g}: not possible")
     factors = np.array([block.stacked(fit.weights) for block in equations.blocks])
@@ -175,7 +175,7 @@ def constrained_intervals(
     for number in range(count):
         other = beta + root @ rng.normal(size=base.size)
         found[number] = constrained_least_squares(
-            replace(fit, beta=other, rho1=fit.R1 @ other), base, conditions, prior, enough=ENOUGH
+            replace(fit, beta=other, rho1=fit.R1 @ other), base, conditions, prior, first_tolerance=ENOUGH
         ).beta
     apart = found - beta
     sides = [np.sqrt(2.0 * np.mean(part**2, axis=0)) for part in (np.minimum(apart, 0.0), np.maximum(apart, 0.0))]
@@ -184,11 +184,11 @@ def constrained_intervals(
     return np.where(seen[:, None], ends, [-np.inf, np.inf])
 
 
-def block_resample_counts(rng: np.random.Generator, count: int, length: int) -> NDArray[np.int64]:
-    """Draw `count` blocks in random runs of `length`; return how often each block was drawn, shape (count,)."""
-    starts = rng.integers(0, count, size=-(-count // length))
-    chosen = ((starts[:, None] + np.arange(length)) % count).ravel()[:count]
-    return np.bincount(chosen, minlength=count)
+def block_resample_counts(rng: np.random.Generator, block_count: int, blocks_per_run: int) -> NDArray[np.int64]:
+    """Draw `block_count` blocks in random runs of `blocks_per_run`; return how often each was drawn, (blocks,)."""
+    starts = rng.integers(0, block_count, size=-(-block_count // blocks_per_run))
+    chosen = ((starts[:, None] + np.arange(blocks_per_run)) % block_count).ravel()[:block_count]
+    return np.bincount(chosen, minlength=block_count)
 
 
 def _least_squares(

@@ -93,20 +93,22 @@ class Statement:
 def exact_block(block: Block, names: Sequence[str]) -> ExactBlock:
     """Return the block with each coefficient as the exact fraction of its shortest decimal, by parameter name."""
     entries = tuple(
-        Affine({names[int(column)]: printed(row[column]) for column in np.flatnonzero(row)}, printed(constant))
+        Affine(
+            {names[int(column)]: exact_decimal(row[column]) for column in np.flatnonzero(row)}, exact_decimal(constant)
+        )
         for row, constant in zip(block.F, block.f, strict=True)
     )
     return ExactBlock(block.name, block.size, entries)
 
 
-def printed(value: float) -> Fraction:
+def exact_decimal(value: float) -> Fraction:
     """Return a float as the exact fraction of its shortest decimal that reads back, which is what files print."""
     return Fraction(repr(float(value)))
 
 
-def trace(block: ExactBlock, z: Sequence[Fraction]) -> Fraction:
+def trace(block: ExactBlock, upper_triangle: Sequence[Fraction]) -> Fraction:
     """Return the trace of a symmetric matrix given by its upper triangle; for a block of single numbers their sum."""
-    return sum((v for v, n in zip(z, counts(block), strict=True) if n == 1), Fraction(0))
+    return sum((v for v, n in zip(upper_triangle, counts(block), strict=True) if n == 1), Fraction(0))
 
 
 def counts(block: ExactBlock) -> list[int]:
@@ -115,7 +117,7 @@ def counts(block: ExactBlock) -> list[int]:
 
 
 def prove(
-    statement: Statement, multipliers: Sequence[Array], y: Array
+    statement: Statement, block_multipliers: Sequence[Array], row_multipliers: Array
 ) -> tuple[list[list[Fraction]], list[Fraction]] | None:
     """Return multipliers (blocks', rows') rounded to fractions that prove infeasibility; None if rounding breaks it.
 
@@ -123,17 +125,17 @@ def prove(
 
     Args:
         statement: statement that the multipliers prove.
-        multipliers: per block, strictly inside the cone on the rows that are not zero, shape (entries,) each.
-        y: multipliers of the statement's rows, shape (rows,).
+        block_multipliers: per block, strictly inside the cone on the rows that are not zero, shape (entries,) each.
+        row_multipliers: multipliers of the statement's rows, shape (rows,).
 
     Returns:
         Multipliers of each block and factors of the rows, in fractions; None where rounding broke the proof.
     """
-    smallest = [_smallest(block, z) for block, z in zip(statement.blocks, multipliers, strict=True)]
+    smallest = [_smallest(block, z) for block, z in zip(statement.blocks, block_multipliers, strict=True)]
     floor = min((value for value in smallest if value > 0.0), default=1e-12)
     digits = min(int(np.ceil(-np.log10(floor))) + _SPARE_DIGITS, _MOST_DIGITS)
-    values: dict[Key, Fraction] = {(-1, i): _rounded(value, digits) for i, value in enumerate(y)}
-    for k, z in enumerate(multipliers):
+    values: dict[Key, Fraction] = {(-1, i): _rounded(value, digits) for i, value in enumerate(row_multipliers)}
+    for k, z in enumerate(block_multipliers):
         values |= {(k, e): _rounded(value, digits) for e, value in enumerate(z) if value != 0.0}
     equations: dict[str, dict[Key, Fraction]] = {name: {} for name in statement.names}
     for i, row in enumerate(statement.rows):
@@ -152,7 +154,7 @@ def prove(
     )
     if exact is None:
         return None
-    factors = [exact[-1, i] for i in range(len(y))]
+    factors = [exact[-1, i] for i in range(len(row_multipliers))]
     Z = [[exact.get((k, e), Fraction(0)) for e in range(len(b.entries))] for k, b in enumerate(statement.blocks)]
     value = sum((factor * beta for factor, beta in zip(factors, statement.right, strict=True)), Fraction(0))
     for block, z_k in zip(statement.blocks, Z, strict=True):
@@ -180,8 +182,8 @@ def _rounded(value: float, digits: int) -> Fraction:
 
 def repair(
     equations: Sequence[Mapping[Unknown, Fraction]],
-    right: Sequence[Fraction],
-    values: Mapping[Unknown, Fraction],
+    right_sides: Sequence[Fraction],
+    approximate_values: Mapping[Unknown, Fraction],
     weight: Callable[[Unknown], float],
 ) -> dict[Unknown, Fraction] | None:
     """Return the values, a few changed so that linear equations hold exactly; None where these contradict each other.
@@ -191,8 +193,8 @@ def repair(
 
     Args:
         equations: coefficients by unknown.
-        right: right-hand sides.
-        values: approximate solution.
+        right_sides: right-hand sides.
+        approximate_values: approximate solution.
         weight: weight of an unknown; one with a larger weight is changed sooner.
     """
     count: dict[Unknown, int] = {}
@@ -200,9 +202,9 @@ def repair(
         for unknown in equation:
             count[unknown] = count.get(unknown, 0) + 1
     solved: list[tuple[Unknown, dict[Unknown, Fraction], Fraction]] = []
-    for equation, target in zip(equations, right, strict=True):
+    for equation, target in zip(equations, right_sides, strict=True):
         row = {unknown: coefficient for unknown, coefficient in equation.items() if coefficient}
-        rest = target - sum((c * values[unknown] for unknown, c in row.items()), Fraction(0))
+        rest = target - sum((c * approximate_values[unknown] for unknown, c in row.items()), Fraction(0))
         for pivot, pivot_row, pivot_rest in solved:
             if factor := row.pop(pivot, Fraction(0)):
                 rest -= factor * pivot_rest
@@ -220,7 +222,7 @@ def repair(
     change: dict[Unknown, Fraction] = {}
     for chosen, row, rest in reversed(solved):
         change[chosen] = rest - sum((c * change.get(unknown, Fraction(0)) for unknown, c in row.items()), Fraction(0))
-    return {unknown: value + change.get(unknown, 0) for unknown, value in values.items()}
+    return {unknown: value + change.get(unknown, 0) for unknown, value in approximate_values.items()}
 
 
 _CLOSE_TO_OPTIMUM = 9.0  # value at most this many times the gap below zero: shares of the blocks are then meaningful
@@ -261,26 +263,28 @@ def split(parts: Sequence[Part], z: Array) -> list[Array]:
     return np.split(z, np.cumsum([len(part.entries) for part in parts])[:-1])
 
 
-def central_path(parts: Sequence[Part], c: Array, z: Array, normals: Array) -> Iterator[Array]:
-    """Yield points of the central path of `minimise c.z` over the cone, only those with negative c.z, to the optimum.
+def central_path(parts: Sequence[Part], objective: Array, interior_point: Array, normals: Array) -> Iterator[Array]:
+    """Yield points of the central path that minimises `objective` over the cone, only negative ones, to the optimum.
 
     Args:
         parts: the cone.
-        c: the objective, shape (entries,).
-        z: an interior point, shape (entries,).
+        objective: the objective, shape (entries,).
+        interior_point: an interior point, shape (entries,).
         normals: orthonormal directions that must not be followed from there, such that what is left of the cone is
             bounded, shape (entries, normals).
     """
     degree = float(sum(len(part.rows) for part in parts))
-    weight = degree / max(abs(float(c @ z)), float(np.linalg.norm(c)) * 1e-3, np.finfo(float).tiny)
+    weight = degree / max(
+        abs(float(objective @ interior_point)), float(np.linalg.norm(objective)) * 1e-3, np.finfo(float).tiny
+    )
     for _ in range(_PATH_STEPS):
-        centred = _centre(parts, weight * c, z, normals)
+        centred = _centre(parts, weight * objective, interior_point, normals)
         if centred is None:
             return
-        z = centred
-        value = float(c @ z)
+        interior_point = centred
+        value = float(objective @ interior_point)
         if value < 0.0:
-            yield z
+            yield interior_point
         if value < -_CLOSE_TO_OPTIMUM * degree / weight:
             return
         weight *= _PATH_STEP
@@ -519,7 +523,7 @@ def certify(
     statement = Statement(
         base.names,
         arm.K,
-        tuple(printed(value) for value in beta),
+        tuple(exact_decimal(value) for value in beta),
         tuple(exact_block(block, base.names) for block in conditions.blocks),
         arm.equalities,
     )
@@ -616,7 +620,7 @@ def _implied(conditions: FeasibleSet) -> list[ExactBlock]:
 
 
 def _witness(statement: Statement, conditions: FeasibleSet, delta: Array) -> dict[str, Any] | None:
-    rounded = {name: printed(value) for name, value in zip(statement.names, delta, strict=True)}
+    rounded = {name: exact_decimal(value) for name, value in zip(statement.names, delta, strict=True)}
     values = _exact_solution(statement, rounded, statement.rows, statement.right)
     return None if values is None else {"kind": "witness", **_set_document(statement, conditions), "delta": values}
 
@@ -629,7 +633,7 @@ def _body(statement: Statement, conditions: FeasibleSet) -> dict[str, str] | Non
         return None
     if delta is None:
         return None
-    rounded = {name: printed(value) for name, value in zip(statement.names, delta, strict=True)}
+    rounded = {name: exact_decimal(value) for name, value in zip(statement.names, delta, strict=True)}
     base = len(statement.K)
     return _exact_solution(statement, rounded, statement.rows[base:], statement.right[base:])
 

@@ -83,15 +83,15 @@ class Motion:
     residual: Array
 
     @classmethod
-    def of(cls, information: Information, beta: Array, places: Sequence[int] | None = None) -> Motion:
+    def of(cls, information: Information, beta: Array, base_indices: Sequence[int] | None = None) -> Motion:
         """Build torque responses to base parameters, and RMS of torque and residual, from a recording's equations.
 
         Args:
             information: the equations.
             beta: all base parameters that were identified from them, SI units, shape (base,).
-            places: indices of the base parameters that the responses are about, in that order; all when None.
+            base_indices: indices of the base parameters that the responses are about, in that order; all when None.
         """
-        wanted = np.arange(information.base) if places is None else np.array(places, dtype=np.intp)
+        wanted = np.arange(information.base) if base_indices is None else np.array(base_indices, dtype=np.intp)
         rows = np.sqrt(np.maximum(information.rows, 1))
         responses = []
         for count, support, factor in zip(rows, information.supports, information.factors, strict=True):
@@ -101,7 +101,7 @@ class Motion:
         torque, residual = information.squared_torques(), information.squared_residuals(beta)
         return cls(tuple(responses), np.sqrt(torque) / rows, np.sqrt(residual) / rows)
 
-    def change(self, difference: Array) -> Array:
+    def torque_change(self, difference: Array) -> Array:
         """Return the RMS torque change of each joint [N m or N] for a difference of base parameters."""
         return np.array([float(np.linalg.norm(response @ difference)) for response in self.responses])
 
@@ -275,11 +275,11 @@ def detect_change(first: ComparedEstimate, second: ComparedEstimate) -> Paramete
     )
 
 
-def holm(p: Sequence[float]) -> list[float]:
+def holm(p_values: Sequence[float]) -> list[float]:
     """Return p-values adjusted for multiple tests (Holm 1979), in the order given, at most 1."""
-    order = np.argsort(p, kind="stable")
-    adjusted = np.empty(len(p))
-    adjusted[order] = np.maximum.accumulate(np.arange(len(p), 0, -1) * np.asarray(p, dtype=float)[order])
+    order = np.argsort(p_values, kind="stable")
+    adjusted = np.empty(len(p_values))
+    adjusted[order] = np.maximum.accumulate(np.arange(len(p_values), 0, -1) * np.asarray(p_values, dtype=float)[order])
     return [float(value) for value in np.minimum(adjusted, 1.0)]
 
 
@@ -293,7 +293,7 @@ def torque_shares(first: ComparedEstimate, second: ComparedEstimate, difference:
     motion = second.motion or first.motion
     if motion is None:
         return None
-    change, tiny = motion.change(difference), np.finfo(float).tiny
+    change, tiny = motion.torque_change(difference), np.finfo(float).tiny
     return change / np.maximum(motion.torque, tiny), change / np.maximum(motion.residual, tiny)
 
 
@@ -304,35 +304,35 @@ def relevant(shares: tuple[Array, Array] | None) -> bool:
     return bool(np.any((shares[0] >= RELEVANT_TORQUE) & (shares[1] >= RELEVANT_RESIDUAL)))
 
 
-def parameter_groups(leading: Sequence[str]) -> dict[tuple[Kind, int], tuple[int, ...]]:
-    """Group base parameters by the (kind, joint or link number from 1) of their `leading` names; return their indices.
+def parameter_groups(leading_names: Sequence[str]) -> dict[tuple[Kind, int], tuple[int, ...]]:
+    """Group base parameters by the (kind, joint or link number from 1) of their `leading_names`; return their indices.
 
     Args:
-        leading: the link parameter that each base parameter is named after.
+        leading_names: the link parameter that each base parameter is named after.
     """
     groups: dict[tuple[Kind, int], list[int]] = {}
-    for place, name in enumerate(leading):
+    for place, name in enumerate(leading_names):
         symbol = name.rstrip("0123456789")
         groups.setdefault((_KINDS.get(symbol, "friction"), int(name[len(symbol) :])), []).append(place)
     return {key: tuple(places) for key, places in groups.items()}
 
 
-def difference_test(first: ComparedEstimate, second: ComparedEstimate, places: Sequence[int]) -> Test:
-    """Test (T^2) whether base parameters at `places` differ between two identifications; p is 1 if none is known.
+def difference_test(first: ComparedEstimate, second: ComparedEstimate, base_indices: Sequence[int]) -> Test:
+    """Test (T^2) whether base parameters at `base_indices` differ between two identifications; p is 1 if none is known.
 
     Args:
         first: one set.
         second: the other.
-        places: indices of the tested parameters, from 0.
+        base_indices: indices of the tested parameters, from 0.
     """
-    chosen = np.array(places, dtype=np.intp)
-    seen = chosen[[np.isfinite(first.covariance[k, k] + second.covariance[k, k]) for k in places]]
+    chosen = np.array(base_indices, dtype=np.intp)
+    seen = chosen[[np.isfinite(first.covariance[k, k] + second.covariance[k, k]) for k in base_indices]]
     d = second.values[seen] - first.values[seen]
     parts = [one.covariance[np.ix_(seen, seen)] for one in (first, second)]
     blocks = [one.blocks for one in (first, second)]
     rounding = _ROUNDING * (np.abs(first.values[seen]) + np.abs(second.values[seen])) + np.finfo(float).tiny
     if len(seen) == 0:
-        return Test(0.0, 0, np.inf, 1.0, len(places))
+        return Test(0.0, 0, np.inf, 1.0, len(base_indices))
     S = parts[0] + parts[1]
     scale = np.maximum(np.sqrt(np.diag(S)), rounding)
     exact = np.diag(S) <= rounding**2
@@ -349,15 +349,15 @@ def difference_test(first: ComparedEstimate, second: ComparedEstimate, places: S
         if degrees - r + 1.0 >= r or r == 1:
             break
     statistic = float(z[:r] @ z[:r])
-    return Test(statistic, r, degrees, probability(statistic, r, degrees), len(places) - r)
+    return Test(statistic, r, degrees, p_value(statistic, r, degrees), len(base_indices) - r)
 
 
-def probability(statistic: float, directions: int, degrees: float) -> float:
-    """Return the p-value of a T^2 (Hotelling): F distribution for finite `degrees` of freedom, else chi-squared."""
-    if np.isinf(degrees):
+def p_value(statistic: float, directions: int, degrees_of_freedom: float) -> float:
+    """Return the p-value of a T^2 (Hotelling): F distribution for finite `degrees_of_freedom`, else chi-squared."""
+    if np.isinf(degrees_of_freedom):
         return float(scipy.special.chdtrc(directions, statistic))
-    below = max(degrees - directions + 1.0, 1.0)
-    return float(scipy.special.fdtrc(directions, below, statistic * below / (degrees * directions)))
+    below = max(degrees_of_freedom - directions + 1.0, 1.0)
+    return float(scipy.special.fdtrc(directions, below, statistic * below / (degrees_of_freedom * directions)))
 
 
 def _degrees(parts: Sequence[Array], blocks: Sequence[int | None]) -> float:
@@ -439,26 +439,26 @@ def causes(difference: Array, K: Array, names: Sequence[str], motion: Motion) ->
     return [simple, *sorted((cause for _, cause in found[1:]), key=lambda cause: -cause.explained)]
 
 
-def meaning_of_cause(cause: Cause, links: int) -> str:
+def meaning_of_cause(cause: Cause, link_count: int) -> str:
     """Return a lower-case phrase on what a cause may mean, from a table: by kind, friction's sign, last link.
 
     Args:
         cause: to explain.
-        links: number of links of the arm; the last one carries tools.
+        link_count: number of links of the arm; the last one carries tools.
     """
     if cause.kind == "body":
-        return _MEANINGS["last" if cause.number == links else "body"]
+        return _MEANINGS["last" if cause.number == link_count else "body"]
     return _MEANINGS["drive inertia"] if cause.kind == "drive inertia" else _MEANINGS[_direction(cause.changes)]
 
 
-def meaning_of_effect(effect: Effect, found: ParameterChange, leading: Sequence[str], links: int) -> str:
+def meaning_of_effect(effect: Effect, change: ParameterChange, leading_names: Sequence[str], link_count: int) -> str:
     """Return a lower-case phrase on what an effect may mean, from a table: by kind, friction's sign, last link."""
     if effect.kind == "friction":
-        return _MEANINGS[_direction({leading[place]: float(found.difference[place]) for place in effect.places})]
-    return _MEANINGS["last" if effect.number == links and effect.kind != "drive inertia" else effect.kind]
+        return _MEANINGS[_direction({leading_names[place]: float(change.difference[place]) for place in effect.places})]
+    return _MEANINGS["last" if effect.number == link_count and effect.kind != "drive inertia" else effect.kind]
 
 
-def friction_ratio(first: ComparedEstimate, second: ComparedEstimate, joint: int) -> tuple[float, float] | None:
+def friction_ratio(first: ComparedEstimate, second: ComparedEstimate, joint_number: int) -> tuple[float, float] | None:
     """Return (viscous plus Coulomb friction, second over first, at the motion's RMS speed; that speed), or None.
 
     The speed is the root mean square of the motion's.
@@ -466,16 +466,16 @@ def friction_ratio(first: ComparedEstimate, second: ComparedEstimate, joint: int
     Args:
         first: the reference.
         second: the later one; the speed is that of its motion.
-        joint: index of the joint, from 1.
+        joint_number: index of the joint, from 1.
 
     Returns:
         The ratio, and the speed [rad/s or m/s]; None where no motion is known, or the first has no such friction.
     """
     motion, place = second.motion or first.motion, {name: k for k, name in enumerate(first.leading)}
-    viscous, coulomb = place.get(f"fv{joint}"), place.get(f"fc{joint}")
-    if motion is None or viscous is None or joint > len(motion.responses):
+    viscous, coulomb = place.get(f"fv{joint_number}"), place.get(f"fc{joint_number}")
+    if motion is None or viscous is None or joint_number > len(motion.responses):
         return None
-    speed = float(np.linalg.norm(motion.responses[joint - 1][:, viscous]))
+    speed = float(np.linalg.norm(motion.responses[joint_number - 1][:, viscous]))
     before, after = (
         one.values[viscous] * speed + (0.0 if coulomb is None else one.values[coulomb]) for one in (first, second)
     )

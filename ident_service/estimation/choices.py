@@ -68,7 +68,7 @@ def significant_choice(option: str, held_out: Mapping[str, Array]) -> Choice:
     """
     usual, *others = held_out
     before = held_out[usual]
-    together = of_thirds_together(held_out)
+    together = rms_over_thirds(held_out)
 
     def clear(name: str) -> bool:
         if not np.all(np.isfinite(held_out[name])):
@@ -81,7 +81,7 @@ def significant_choice(option: str, held_out: Mapping[str, Array]) -> Choice:
     return Choice(option, min(better, key=lambda name: together[name], default=usual), together)
 
 
-def of_thirds_together(held_out: Mapping[str, Array]) -> dict[str, float]:
+def rms_over_thirds(held_out: Mapping[str, Array]) -> dict[str, float]:
     """Return per alternative the root mean square over the thirds' torque errors [percent]."""
     return {name: float(np.sqrt(np.mean(np.square(errors)))) for name, errors in held_out.items()}
 
@@ -106,7 +106,7 @@ def held_out_thirds(
         rest = Information.sum([part for other, part in enumerate(parts) if other != number])
         try:
             fit = ordinary_least_squares(rest, weights)
-            beta = constrained_least_squares(fit, base, conditions, enough=ENOUGH).beta
+            beta = constrained_least_squares(fit, base, conditions, first_tolerance=ENOUGH).beta
         except SolverError:
             return np.full(len(parts), np.inf)
         left, torque = (

@@ -46,13 +46,13 @@ class CustomFunction:
     function: Callable[[Mapping[str, cp.Expression], Mapping[str, cp.Expression]], object]
 
     def constraints(
-        self, link: Mapping[str, cp.Expression], base: Mapping[str, cp.Expression]
+        self, link_parameters: Mapping[str, cp.Expression], base_parameters: Mapping[str, cp.Expression]
     ) -> tuple[list[cp.Constraint], cp.Expression | None]:
         """Call the user's function; return its constraints, checked to be convex, and its penalty or None.
 
         Args:
-            link: link parameters in SI units by their names (`m7`).
-            base: base parameters in SI units by their expressions, as `ident base-parameters` prints them.
+            link_parameters: link parameters in SI units by their names (`m7`).
+            base_parameters: base parameters in SI units by their expressions, as `ident base-parameters` prints them.
 
         Raises:
             CustomError: the function raises, or returns something else or something that is not convex.
@@ -60,7 +60,7 @@ class CustomFunction:
         import cvxpy as cp
 
         try:
-            returned = self.function(MappingProxyType(dict(link)), MappingProxyType(dict(base)))
+            returned = self.function(MappingProxyType(dict(link_parameters)), MappingProxyType(dict(base_parameters)))
         except Exception as error:
             raise CustomError(f"{self.name} raised {_error_words(error, self.file)}") from error
         penalty: Any = None
@@ -95,21 +95,21 @@ class CustomFunction:
             raise CustomError(f"the penalty of {self.name} is not convex by cvxpy's rules (DCP): {_short(penalty)}")
 
 
-def load_custom(name: str, folder: Path) -> CustomFunction:
+def load_custom(function_name: str, folder: Path) -> CustomFunction:
     """Import the function `module:function` that a description names; raises CustomError if that fails.
 
     Args:
-        name: `module:function`.
+        function_name: `module:function`.
         folder: of the description, where the module is looked for after `sys.path` (so after PYTHONPATH).
 
     Raises:
         CustomError: there is no such module or function, or the module raises while it is imported.
     """
-    module, function = name.split(":")
+    module, function = function_name.split(":")
     file = f"{module.split('.')[0]}.py"
     try:
         with _importable(folder):
-            found = EntryPoint(name=function, value=name, group="ident_service.custom").load()
+            found = EntryPoint(name=function, value=function_name, group="ident_service.custom").load()
     except AttributeError as error:
         if module in sys.modules and not hasattr(sys.modules[module], function):
             raise CustomError(f"the module {module!r} has no function {function!r}") from None
@@ -123,11 +123,13 @@ def load_custom(name: str, folder: Path) -> CustomFunction:
     except (Exception, SystemExit) as error:
         raise CustomError(f"importing {module!r} raised {_error_words(error, file)}") from error
     if not callable(found):
-        raise CustomError(f"{name} is {_kind(found)}, not a function")
+        raise CustomError(f"{function_name} is {_kind(found)}, not a function")
     source = getattr(sys.modules[module], "__file__", None)
     if source is None:
         raise CustomError(f"the module {module!r} is no file, so that a result could not name what it was made with")
-    return CustomFunction(name, Path(source).name, hashlib.sha256(Path(source).read_bytes()).hexdigest(), found)
+    return CustomFunction(
+        function_name, Path(source).name, hashlib.sha256(Path(source).read_bytes()).hexdigest(), found
+    )
 
 
 @contextmanager

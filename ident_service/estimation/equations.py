@@ -124,17 +124,19 @@ class Equations:
         """Return the information of rows in motion; of all rows where there are none in motion."""
         return self.total if self.total.rows.any() else self.everything
 
-    def with_torques_times(self, scales: Array) -> Equations:
-        """Return a copy with each joint's measured torque multiplied by `scales`, shape (joints,)."""
-        blocks, near = (tuple(one.with_torques_times(scales) for one in part) for part in (self.blocks, self.near))
+    def with_torques_times(self, joint_factors: Array) -> Equations:
+        """Return a copy with each joint's measured torque multiplied by `joint_factors`, shape (joints,)."""
+        blocks, near = (
+            tuple(one.with_torques_times(joint_factors) for one in part) for part in (self.blocks, self.near)
+        )
         return replace(self, blocks=blocks, near=near)
 
-    def with_near(self, shares: Array) -> Equations:
-        """Return a copy with rows near standstill merged into the blocks, multiplied by `shares` per joint."""
+    def with_standstill_rows(self, joint_factors: Array) -> Equations:
+        """Return a copy with rows near standstill merged into the blocks, multiplied by `joint_factors` per joint."""
         if not any(near.rows.any() for near in self.near):
             return self
         pairs = zip(self.blocks, self.near, strict=True)
-        return replace(self, blocks=tuple(block.merged(near.times(shares)) for block, near in pairs), near=())
+        return replace(self, blocks=tuple(block.merged(near.times(joint_factors)) for block, near in pairs), near=())
 
 
 @one_blas_thread()
@@ -144,9 +146,9 @@ def equations(
     base: BaseParameters,
     row_weights: RowWeights | None = None,
     *,
-    judging: bool = False,
+    allow_still_joints: bool = False,
 ) -> Equations:
-    """Read recordings into compressed equations in blocks of time; raises if a joint never moves, unless `judging`.
+    """Read recordings into equations in blocks of time; raises if a joint never moves, unless `allow_still_joints`.
 
     Args:
         recordings: to read, one or several.
@@ -154,62 +156,62 @@ def equations(
         base: grouping of the parameters.
         row_weights: function that returns the factors of the rows, shape (samples, joints); with it, rows near
             standstill are among the blocks.
-        judging: whether only errors are computed from them, for which no joint has to move.
+        allow_still_joints: whether only errors are computed from them, for which no joint has to move.
 
     Raises:
-        RecordingError: a recording does not fit the arm or, unless `judging`, some joint moves in none of them.
+        RecordingError: a recording does not fit the arm or, unless `allow_still_joints`, some joint never moves.
     """
     whole = tuple(recordings) if isinstance(recordings, Sequence) else (recordings,)
     felt = sparsity(model.chain, model.layout, base.base)
     rows_of = partial(equation_rows, model=model, base=base)
-    return equations_of(whole, model, felt, rows_of, row_weights, judging=judging)
+    return equations_of(whole, model, felt, rows_of, row_weights, allow_still_joints=allow_still_joints)
 
 
 @one_blas_thread()
 def equations_of(
     recordings: Sequence[Recording],
     model: ArmModel,
-    felt: tuple[NDArray[np.intp], ...],
+    joint_columns: tuple[NDArray[np.intp], ...],
     rows_of: Callable[[Recording], Iterator[Rows]],
     row_weights: RowWeights | None = None,
     *,
-    judging: bool = False,
+    allow_still_joints: bool = False,
 ) -> Equations:
-    """Compress the rows of `rows_of` into blocks of time; raises if a joint never moves, unless `judging`.
+    """Compress the rows of `rows_of` into blocks of time; raises if a joint never moves, unless `allow_still_joints`.
 
     Args:
         recordings: to read.
         model: model whose configuration says how to cut the recordings into blocks.
-        felt: per joint, which columns it feels, increasing.
+        joint_columns: per joint, which columns it feels, increasing.
         rows_of: function that yields a recording's rows in consecutive chunks; they may have further columns than those
             of base parameters.
         row_weights: function that returns the factors of the rows, as for `equations`.
-        judging: as for `equations`.
+        allow_still_joints: as for `equations`.
 
     Raises:
-        RecordingError: a recording does not fit the arm or, unless `judging`, some joint moves in none of them.
+        RecordingError: a recording does not fit the arm or, unless `allow_still_joints`, some joint never moves.
     """
     gathered, moved = Equations((), 0), np.zeros(model.chain.joints, dtype=np.bool_)
     for recording, cut in zip(recordings, cut_into_stretches(recordings, model), strict=True):
-        gathered, moves = _gathered(gathered, rows_of(recording), model.chain.joints, felt, cut, row_weights)
+        gathered, moves = _gathered(gathered, rows_of(recording), model.chain.joints, joint_columns, cut, row_weights)
         moved |= moves
-    if not judging:
+    if not allow_still_joints:
         require_motion(recordings, model, moved)
     return gathered
 
 
-def require_motion(recordings: Sequence[Recording], model: ArmModel, moved: NDArray[np.bool_]) -> None:
-    """Raise RecordingError unless every joint in `moved` is True; return nothing.
+def require_motion(recordings: Sequence[Recording], model: ArmModel, joints_moved: NDArray[np.bool_]) -> None:
+    """Raise RecordingError unless every joint in `joints_moved` is True; return nothing.
 
     Args:
-        recordings: recordings that `moved` is of.
+        recordings: recordings that `joints_moved` is of.
         model: the arm.
-        moved: whether each joint was faster than `identification.reversal.speed` somewhere, shape (joints,).
+        joints_moved: whether each joint was faster than `identification.reversal.speed` somewhere, shape (joints,).
 
     Raises:
         RecordingError: with the joints that were not, and what to do.
     """
-    still = [name for name, moves in zip(model.chain.names, moved, strict=True) if not moves]
+    still = [name for name, moves in zip(model.chain.names, joints_moved, strict=True) if not moves]
     if not still:
         return
     where = f"{len(recordings)} recordings" if len(recordings) > 1 else "it"
@@ -222,7 +224,7 @@ def require_motion(recordings: Sequence[Recording], model: ArmModel, moved: NDAr
             f"{said}, and samples are {period:.3g} s apart: is the time not in seconds? Name its unit: "
             "recording.columns: {t: {column: NAME, unit: ms}}",
         )
-    if not moved.any():
+    if not joints_moved.any():
         raise RecordingError(
             recordings[0].path,
             f"{said}: are positions in the unit that recording.columns names? It is rad or m where none is named. "
@@ -262,7 +264,7 @@ def cut_into_stretches(recordings: Sequence[Recording], model: ArmModel) -> tupl
     lengths = [_block_seconds(recording, with_chosen_cutoff(model, [recording])) for recording in recordings]
     if model.config.identification.period is not None:
         return tuple(Stretches(length, recording=index) for index, length in enumerate(lengths))
-    return stretches(recordings, lengths, model.config.recording, phases=LEAST_BLOCKS)
+    return stretches(recordings, lengths, model.config.recording, stretches_per_period=LEAST_BLOCKS)
 
 
 def _gathered(
@@ -302,7 +304,7 @@ def _gathered(
                 labels.append(cut.label(int(number[begin])))
             current = number[begin]
         moved |= rows.moving.any(axis=0)
-        before = bounded(Equations(tuple(blocks), before.samples, tuple(near), tuple(labels)))
+        before = with_merged_blocks(Equations(tuple(blocks), before.samples, tuple(near), tuple(labels)))
     return replace(before, samples=before.samples + samples), moved
 
 
@@ -481,7 +483,7 @@ def _rows(motion: Motion, H_b: Array, torque: Array, model: ArmModel) -> Rows:
     return Rows(motion.time, H_b, torque, motion.keep, motion.position, motion.velocity, moving)
 
 
-def bounded(gathered: Equations) -> Equations:
+def with_merged_blocks(gathered: Equations) -> Equations:
     """Merge blocks in pairs until at most 256 are left: of the same motion first, else neighbours."""
     while len(gathered.blocks) > MAX_BLOCKS:
         pairs = _pairs(gathered.labels)

@@ -36,7 +36,7 @@ from ident_service.estimation.shape_uncertainty import ShapeUncertainty, shape_u
 from ident_service.estimation.spectra import with_chosen_cutoff
 from ident_service.estimation.torque_constants import TorqueConstants, identify_torque_constants
 from ident_service.estimation.torque_delay import Delay, choose_delay, estimate_delay, with_delay
-from ident_service.estimation.uncertainty import uncertainty, widening
+from ident_service.estimation.uncertainty import student_factors, uncertainty
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
@@ -267,7 +267,7 @@ def _with_known_shape(
 ) -> Fit:
     model = prepared.model
     shares = standstill_weights(prepared.equations)
-    gathered = prepared.equations.with_near(shares)
+    gathered = prepared.equations.with_standstill_rows(shares)
     if method == "ols":
         return _fit_with_uncertainty("ols", ordinary_least_squares(gathered.total), gathered, shares)
     fit = weighted_least_squares(gathered.total)
@@ -292,7 +292,7 @@ def _with_known_shape(
     # The instrumental estimate's variances come from as many equally weighted blocks: same degrees of freedom.
     remarks = _convergence_warnings("the instrumental estimate", refined.change, instruments.SETTLED)
     degrees = uncertainty(gathered, fit).degrees
-    deviations = np.sqrt(np.diag(refined.covariance)) * widening(degrees)
+    deviations = np.sqrt(np.diag(refined.covariance)) * student_factors(degrees)
     return Fit(moved, gathered, gathered, refined.covariance, deviations, degrees, None, shares, "iv", remarks)
 
 

@@ -33,12 +33,12 @@ from ident_service.estimation.choices import (
     Choice,
     best_choice,
     held_out_thirds,
-    of_thirds_together,
+    rms_over_thirds,
     significant_choice,
 )
 from ident_service.estimation.equations import Equations, Rows, equation_rows, require_motion
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
-from ident_service.estimation.least_squares import Moments, ridge, weighted_least_squares
+from ident_service.estimation.least_squares import Moments, solve_with_ridge, weighted_least_squares
 from ident_service.estimation.robust_regression import standstill_weights
 from ident_service.estimation.signal_processing import windows
 from ident_service.model.arm_model import ArmModel
@@ -470,9 +470,9 @@ def fitted_friction_parameters(model: ArmModel) -> tuple[str, ...]:
     )
 
 
-def searched(key: str) -> float:
-    """Return the standard deviation of the log of friction number `key`, were it uniform over its search range."""
-    grid = _GRIDS[key][_GRIDS[key] > 0.0]
+def log_deviation_of_search_range(number_name: str) -> float:
+    """Return the standard deviation of the log of a named friction number, were it uniform over its search range."""
+    grid = _GRIDS[number_name][_GRIDS[number_name] > 0.0]
     return float(np.log(grid[-1] / grid[0]) / np.sqrt(12.0))
 
 
@@ -608,7 +608,7 @@ class _Search:
         values, choices = fitted, []
         gathered = self._equations(fitted)
         shares = standstill_weights(gathered)
-        gathered = gathered.with_near(shares)
+        gathered = gathered.with_standstill_rows(shares)
         weights = weighted_least_squares(gathered.total).weights
         errors = held_out_thirds(gathered.blocks, weights, self.base, conditions)
         for key in wanted:
@@ -617,13 +617,11 @@ class _Search:
             without = start | {key: np.full_like(values[key], _NONE[key])}
             others = [other for other in wanted if other != key and not np.all(values[other] <= _NONE[other])]
             without = self.finer(self.coordinate_search(without, others), others)
-            blocks = self._equations(without).with_near(shares).blocks
+            blocks = self._equations(without).with_standstill_rows(shares).blocks
             both = {"fit": errors, "none": held_out_thirds(blocks, weights, self.base, conditions)}
             option = f"friction.{key}"
             simpler = key == "stribeck_velocity"
-            choices.append(
-                best_choice(option, of_thirds_together(both)) if simpler else significant_choice(option, both)
-            )
+            choices.append(best_choice(option, rms_over_thirds(both)) if simpler else significant_choice(option, both))
             values, errors = (values if choices[-1].value == "fit" else without), both[choices[-1].value]
         return values, choices
 
@@ -652,7 +650,7 @@ def _unpredicted(thirds: Sequence[Moments], beta: Array, terms: NDArray[np.bool_
         left = [rest.T @ third.products[joint] @ rest for third in thirds]
         for number, unseen in enumerate(left):
             told = np.sum([other for place, other in enumerate(left) if place != number], axis=0)
-            error = np.append(-ridge(told[:-1, :-1], told[:-1, -1]), 1.0)
+            error = np.append(-solve_with_ridge(told[:-1, :-1], told[:-1, -1]), 1.0)
             total[joint] += max(float(error @ unseen @ error), 0.0)
     return total
 

@@ -196,7 +196,7 @@ def identify(
     set_name: SetName | None = None,
     custom: CustomFunction | None = None,
     solver: str | None = None,
-    again: bool = False,
+    ask_second_solver: bool = False,
     step: Callable[[str, float], None] = lambda words, share: None,
     torque_constants: bool = False,
 ) -> Estimate:
@@ -210,7 +210,7 @@ def identify(
         set_name: feasible set to hold the estimate in, `none` for none; the configuration's when None.
         custom: the function that the configuration's `constraints.custom` names, loaded by `load_custom`.
         solver: name of the solver for the problems posed in cvxpy: those with `custom`, and the second opinion.
-        again: whether to solve the constrained problem a second time.
+        ask_second_solver: whether to solve the constrained problem a second time.
         step: called with what is being done and the share of the time that is over, from 0 to 1, as a rule.
         torque_constants: whether to identify those of the motors with the parameters; needs a known payload.
 
@@ -223,7 +223,7 @@ def identify(
     """
     wanted = method or model.config.identification.method
     _check(wanted, recordings, validation)
-    _check_convex(model, set_name, custom, solver, again=again)
+    _check_convex(model, set_name, custom, solver, again=ask_second_solver)
     if torque_constants:
         require_known_load(recordings, model)
     base = base_parameters(model.chain, model.layout)
@@ -257,7 +257,7 @@ def identify(
         knowledge = CustomKnowledge(custom, by.lower(), *(error.relative_percent for error in errors))
     deviations, as_zero = found.deviations, negligible(prepared.equations.everything)
     second = None
-    if again:
+    if ask_second_solver:
         second = second_opinion(
             held[kind], found.fit, base, conditions, deviations, prior=prior, custom=custom, solver=solver
         )
@@ -383,7 +383,9 @@ def _check_convex(
 
 
 def _validation_equations(recording: Recording, prepared: Prepared, base: BaseParameters) -> Equations:
-    return equations(recording, prepared.model, base, judging=True).with_torques_times(prepared.torque_scales)
+    return equations(recording, prepared.model, base, allow_still_joints=True).with_torques_times(
+        prepared.torque_scales
+    )
 
 
 def _prior(model: ArmModel, found: Fit, base: BaseParameters, conditions: FeasibleSet) -> Prior | None:

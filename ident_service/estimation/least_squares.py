@@ -67,7 +67,7 @@ def weighted_least_squares(information: Information) -> LeastSquares:
     near = Moments(information.supports, products, information.rows, information.base).weights()
     # Rounded, so that rounds begin at the same weights, and end at them, whatever a processor made of the products.
     weights = np.exp(np.round(np.log(near), _START_DECIMALS))
-    floor = least_deviations(information)
+    floor = residual_deviation_floors(information)
     for _ in range(_MOST_ROUNDS):
         beta = _solution(information, weights).beta
         degrees = _degrees(information)
@@ -84,7 +84,7 @@ def _degrees(equations: Information | Moments) -> Array:
     return np.asarray(np.maximum(equations.rows - equations.base / len(equations.rows), 1))
 
 
-def least_deviations(equations: Information | Moments) -> Array:
+def residual_deviation_floors(equations: Information | Moments) -> Array:
     """Return the floor of each joint's residual deviation [N m or N], 1e-9 of its RMS torque, shape (joints,).
 
     A joint whose torque is always zero has those of the others.
@@ -203,14 +203,14 @@ class Moments:
 
     def solved(self, weights: Array) -> Array:
         """Return the least-squares base parameters, each joint's equations multiplied by its weight; shape (base,)."""
-        return ridge(*self._normal(weights))
+        return solve_with_ridge(*self._normal(weights))
 
     def estimate(self) -> tuple[Array, Array]:
         """Return the unweighted least-squares estimate and its standard deviations (eq. 81), shape (base,) each."""
         total, right = self._normal(np.ones(len(self.products)))
-        beta = ridge(total, right)
+        beta = solve_with_ridge(total, right)
         variance = float(self.squared_residuals(beta).sum()) / max(int(self.rows.sum()) - self.base, 1)
-        inverse = ridge(total, np.eye(self.base))
+        inverse = solve_with_ridge(total, np.eye(self.base))
         variances = np.where(np.diag(inverse) > 0.0, variance * np.diag(inverse), np.inf)
         return beta, np.sqrt(variances)
 
@@ -228,14 +228,14 @@ class Moments:
             total += weight**2 * whole
         return total[:, :-1], total[:, -1]
 
-    def weights(self, start: Array | None = None) -> Array:
+    def weights(self, start_weights: Array | None = None) -> Array:
         """Return the factors of the joints' equations that make their residuals equally large, shape (joints,).
 
         Args:
-            start: factors to begin with, such as those of other columns; ones when None.
+            start_weights: factors to begin with, such as those of other columns; ones when None.
         """
-        floor = least_deviations(self)
-        weights = np.ones(len(self.products)) if start is None else start
+        floor = residual_deviation_floors(self)
+        weights = np.ones(len(self.products)) if start_weights is None else start_weights
         for _ in range(_MOST_STEPS):
             left = np.sqrt(self.squared_residuals(self.solved(weights)) / _degrees(self))
             deviations = np.maximum(left, floor)
@@ -255,16 +255,16 @@ class Moments:
         return np.maximum(found, 0.0)
 
 
-def ridge(products: Array, right: Array) -> Array:
+def solve_with_ridge(products: Array, right_side: Array) -> Array:
     """Solve normal equations with a tiny ridge, so that equal columns share; columns of zeros get zero.
 
     Args:
         products: products of the columns with each other, shape (columns, columns).
-        right: products of the columns with the right-hand sides, shape (columns,) or (columns, cases).
+        right_side: products of the columns with the right-hand sides, shape (columns,) or (columns, cases).
     """
     sizes = np.diag(products)
     seen = sizes > _LEAST_COLUMN**2 * sizes.max(initial=0.0)
     unit = np.sqrt(np.where(seen, sizes, np.inf))
     scaled = products / np.outer(unit, unit)
     np.fill_diagonal(scaled, 1.0 + _RIDGE)
-    return np.asarray((np.linalg.solve(scaled, (right.T / unit).T).T / unit).T)
+    return np.asarray((np.linalg.solve(scaled, (right_side.T / unit).T).T / unit).T)

@@ -98,19 +98,19 @@ class Reading:
         """Return whether only signs of torques are negated, which needs no other regressor."""
         return self.which == "torque" and self.negates
 
-    def read(self, columns: Array, what: Literal["torque", "position"]) -> Array:
-        """Return samples, (samples, joints), exchanged or scaled by this reading; unchanged if it is not about `what`.
+    def read(self, samples: Array, quantity: Literal["torque", "position"]) -> Array:
+        """Return samples, (samples, joints), exchanged or scaled by this reading; unchanged if not about `quantity`.
 
         `which` says whether the reading is about torques, positions (with velocities) or both. Time and zero are not
         applied.
         """
-        if self.which not in (what, "both"):
-            return columns
-        read = columns.copy()
+        if self.which not in (quantity, "both"):
+            return samples
+        read = samples.copy()
         if self.exchanges:
-            read[:, self.joints] = columns[:, self.joints[::-1]]
+            read[:, self.joints] = samples[:, self.joints[::-1]]
         else:
-            read[:, self.joints] *= 1.0 / self.factor if what == "torque" and self.which == "both" else self.factor
+            read[:, self.joints] *= 1.0 / self.factor if quantity == "torque" and self.which == "both" else self.factor
         return read
 
 
@@ -128,13 +128,13 @@ class MisreadColumns:
     before: TorqueError
     after: TorqueError
 
-    def sentence(self, names: Sequence[str]) -> str:
+    def sentence(self, joint_names: Sequence[str]) -> str:
         """Return a sentence for people: which columns seem misread, the errors before and after, and what to correct.
 
         Args:
-            names: of the joints.
+            joint_names: of the joints.
         """
-        named = [names[joint] for joint in self.reading.joints]
+        named = [joint_names[joint] for joint in self.reading.joints]
         before, after = self.before.joint_relative_percent, self.after.joint_relative_percent
         each = ", ".join(
             f"of {name} {before[joint]:.0f} % and {after[joint]:.2g} %"
@@ -234,7 +234,7 @@ def misread_columns(estimate: Estimate, recordings: Sequence[Recording]) -> Misr
             after = _constrained_error(estimate, equations.information(reading), weights)
         except SolverError:  # it explains nothing, and must not end what has been identified
             continue
-        gained_by = gains(before, after)
+        gained_by = error_reductions(before, after)
         gained = float(gained_by.sum()) - (0.0 if reading.negates else np.log(LIKELIER))
         enough = gained_by.sum() >= np.log(BETTER) and gained_by.min() >= -np.log(NONE_WORSE)
         if reading.is_measured and reading.which != "torque":
@@ -321,21 +321,21 @@ def _best_of_each_kind(readings: Sequence[Reading], errors: Iterable[Array], bef
     return list(found.values())
 
 
-def weights_of_joints(as_read: TorqueError) -> Array:
+def weights_of_joints(torque_error: TorqueError) -> Array:
     """Return the reciprocals of the joints' rms errors, scaled to a geometric mean of 1; shape (joints,)."""
-    rms = as_read.joint_rms
+    rms = torque_error.joint_rms
     weights = 1.0 / np.maximum(rms, 1e-9 * max(float(rms.max(initial=0.0)), np.finfo(float).tiny))
     return np.asarray(weights / np.exp(np.mean(np.log(weights))))
 
 
-def gains(before: TorqueError, after: TorqueError) -> Array:
+def error_reductions(before: TorqueError, after: TorqueError) -> Array:
     """Return per joint the logarithm of its torque error before over after, positive where better; shape (joints,)."""
     return _gains(before.joint_relative_percent, after.joint_relative_percent)
 
 
 def _constrained_error(estimate: Estimate, information: Information, weights: Array) -> TorqueError:
     fit = ordinary_least_squares(information, weights)
-    found = constrained_least_squares(fit, estimate.base, estimate.conditions, enough=ENOUGH)
+    found = constrained_least_squares(fit, estimate.base, estimate.conditions, first_tolerance=ENOUGH)
     return torque_error(information, found.beta)
 
 

@@ -23,7 +23,7 @@ from ident_service.estimation.misread_columns import (
     NONE_WORSE,
     SUSPECTED_FROM,
     WHOLE_CONCERNED,
-    gains,
+    error_reductions,
     weights_of_joints,
 )
 from ident_service.model.base_parameters import base_parameters
@@ -53,17 +53,17 @@ class MisreadGravity:
     after: TorqueError
 
     @property
-    def gained(self) -> float:
+    def error_reduction(self) -> float:
         """Return the sum over joints of the logarithm of the torque error before over after; positive is better."""
-        return float(gains(self.before, self.after).sum())
+        return float(error_reductions(self.before, self.after).sum())
 
-    def sentence(self, names: Sequence[str]) -> str:
+    def sentence(self, joint_names: Sequence[str]) -> str:
         """Return a sentence for people: which gravity seems right, the errors before and after, and what to correct.
 
         Args:
-            names: of the joints.
+            joint_names: of the joints.
         """
-        pairs = zip(names, self.before.joint_relative_percent, self.after.joint_relative_percent, strict=True)
+        pairs = zip(joint_names, self.before.joint_relative_percent, self.after.joint_relative_percent, strict=True)
         each = ", ".join(f"of {name} {before:.2g} % and {after:.2g} %" for name, before, after in pairs)
         errors = f"the torque error in motion is {self.before.relative_percent:.1f} %, and"
         left = f"{self.after.relative_percent:.2g} %"
@@ -114,9 +114,9 @@ def misread_gravity(estimate: Estimate, recordings: Sequence[Recording]) -> Misr
         except SolverError:  # it explains nothing, and must not end what has been identified
             continue
         enough = np.log(BETTER) + (np.log(LIKELIER) if gravity.any() else 0.0)
-        none_worse = gains(before, found.after).min() >= -np.log(NONE_WORSE)
-        explains = found.gained >= enough and none_worse and found.after.relative_percent < EXPLAINED
-        if explains and (best is None or found.gained > best.gained):
+        none_worse = error_reductions(before, found.after).min() >= -np.log(NONE_WORSE)
+        explains = found.error_reduction >= enough and none_worse and found.after.relative_percent < EXPLAINED
+        if explains and (best is None or found.error_reduction > best.error_reduction):
             best = found
     return best
 
@@ -131,7 +131,7 @@ def _error(estimate: Estimate, parts: Sequence[Recording], gravity: Array, weigh
     prepared = estimate.prepared
     model = replace(prepared.model, chain=replace(prepared.model.chain, gravity=gravity))
     base = base_parameters(model.chain, model.layout)
-    moving = equations(parts, model, base, judging=True).with_torques_times(prepared.torque_scales).moving
+    moving = equations(parts, model, base, allow_still_joints=True).with_torques_times(prepared.torque_scales).moving
     fit = ordinary_least_squares(moving, weights)
-    found = constrained_least_squares(fit, base, estimate.conditions, enough=ENOUGH)
+    found = constrained_least_squares(fit, base, estimate.conditions, first_tolerance=ENOUGH)
     return torque_error(moving, found.beta)

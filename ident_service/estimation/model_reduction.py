@@ -83,14 +83,14 @@ class Essential:
 
 @one_blas_thread()
 def essential_parameters(
-    equations: Equations, fit: LeastSquares, *, level: float = 0.05, covariance: Array | None = None
+    equations: Equations, fit: LeastSquares, *, significance_level: float = 0.05, covariance: Array | None = None
 ) -> Essential:
     """Remove base parameters that data do not need until an F-test refuses; return the rest; raises if any is unseen.
 
     Args:
         equations: equations that `fit` solves.
         fit: ordinary or weighted least squares of all base parameters; its weights stay.
-        level: level of the test: probability, between 0 and 1, that chance alone makes it call a model worse that is
+        significance_level: probability, between 0 and 1, that chance alone makes the test call a model worse that is
             not.
         covariance: covariance of `fit` from blocks, shape (base, base); computed when None.
 
@@ -100,8 +100,8 @@ def essential_parameters(
     size = len(fit.beta)
     if fit.rank < size:
         raise ModelError(f"the data excite {fit.rank} of {size} directions; record a motion that excites all of them")
-    if not 0.0 < level < 1.0:
-        raise ModelError(f"{level=} is no level of a test")
+    if not 0.0 < significance_level < 1.0:
+        raise ModelError(f"level={significance_level!r} is no level of a test")
     covariance = block_covariance(equations, fit) if covariance is None else covariance
     from scipy.special import fdtri  # loads for 0.2 s, and few ask for essential parameters
 
@@ -122,7 +122,7 @@ def essential_parameters(
         new_values, new_deviations = _refit(fit, spread, rest)
         removed = len(done) + 1
         lost = float(np.sum((fit.rho1 - fit.R1[:, rest] @ new_values) ** 2)) / removed
-        F, critical = lost / noise, float(fdtri(removed, samples - size, 1.0 - level))
+        F, critical = lost / noise, float(fdtri(removed, samples - size, 1.0 - significance_level))
         step = Elimination(int(kept[weakest]), float(ratio[weakest]), F, critical)
         if critical < F:
             refused = step
@@ -138,24 +138,24 @@ def essential_parameters(
         eliminated=tuple(done),
         refused=refused,
         effective_samples=samples,
-        level=level,
+        level=significance_level,
         full=torque_error(total, fit.beta),
         reduced=torque_error(total, beta),
     )
 
 
-def effective_samples(fit: LeastSquares, covariance: Array, rows: int) -> float:
+def effective_samples(fit: LeastSquares, covariance: Array, row_count: int) -> float:
     """Return how many independent rows would give the estimate's uncertainty, at least one more than parameters.
 
     Args:
         fit: the estimate, with its white standard deviations (eq. 81).
         covariance: covariance of the estimate from blocks, shape (base, base).
-        rows: number of rows that the estimate was fitted to.
+        row_count: number of rows that the estimate was fitted to.
     """
     white, blocks = fit.standard_deviations**2, np.diag(covariance)
     seen = np.isfinite(white) & np.isfinite(blocks) & (blocks > 0.0)
     ratio = float(np.median(white[seen] / blocks[seen])) if seen.any() else 1.0
-    return max(rows * min(ratio, 1.0), len(fit.beta) + 1.0)
+    return max(row_count * min(ratio, 1.0), len(fit.beta) + 1.0)
 
 
 def _refit(fit: LeastSquares, spread: Array, kept: NDArray[np.intp]) -> tuple[Array, Array]:

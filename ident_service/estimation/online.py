@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ident_service.config.recording import RecordingFormat
 from ident_service.errors import RecordingError
-from ident_service.estimation.equations import LEAST_BLOCKS, Equations, Rows, bounded, equation_rows
+from ident_service.estimation.equations import LEAST_BLOCKS, Equations, Rows, equation_rows, with_merged_blocks
 from ident_service.estimation.least_squares import ordinary_least_squares
 from ident_service.estimation.spectra import EDGE, USUAL
 from ident_service.estimation.uncertainty import Verdict, negligible, uncertainty, verdicts
@@ -150,7 +150,7 @@ class SequentialLeastSquares:
                 blocks.append(block)
                 labels.append((0, number % self._phases if self._phases else number))
             self._number = number
-        return bounded(Equations(tuple(blocks), 0, (), tuple(labels)))
+        return with_merged_blocks(Equations(tuple(blocks), 0, (), tuple(labels)))
 
     @one_blas_thread()
     def uncertainty(self) -> ParameterUncertainty | None:

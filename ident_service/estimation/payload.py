@@ -39,7 +39,7 @@ from ident_service.estimation.change_detection import (
     Motion,
     Test,
     difference_test,
-    probability,
+    p_value,
     relevant,
     torque_shares,
 )
@@ -170,12 +170,12 @@ class Payload:
 
 
 @one_blas_thread()
-def identify_payload(arm: KnownArm, recorded: Equations, *, refit_offsets: bool = False) -> Payload:
+def identify_payload(arm: KnownArm, loaded_equations: Equations, *, refit_offsets: bool = False) -> Payload:
     """Estimate the body added to or taken off an identified arm, or that there is none, from the torques' difference.
 
     Args:
         arm: the arm as it was identified, with another load or none.
-        recorded: equations of the second recording in the arm's base parameters, from `fit.gather`.
+        loaded_equations: equations of the second recording in the arm's base parameters, from `fit.gather`.
         refit_offsets: whether the offset of every joint may differ too, as after a restart that zeroed the torques.
 
     Raises:
@@ -184,14 +184,14 @@ def identify_payload(arm: KnownArm, recorded: Equations, *, refit_offsets: bool 
         SolverError: the solver stopped without an optimum.
     """
     base, T, own = _columns(arm, refit_offsets)
-    reduced = _reduced(recorded, arm.beta, T)
+    reduced = _reduced(loaded_equations, arm.beta, T)
     fit = weighted_least_squares(reduced.total)
     from_blocks = uncertainty(reduced, fit)
     noise = from_blocks.covariance
-    G = _dependence(recorded.total, T, fit)
+    G = _dependence(loaded_equations.total, T, fit)
     covariance, doubt = _payload_covariance(arm, noise, G)
     deviations = np.sqrt(from_blocks.deviations**2 + np.diag(doubt))
-    total = recorded.total
+    total = loaded_equations.total
     seen = np.isfinite(np.diag(covariance))
 
     responses = Motion.of(reduced.total, fit.beta)
@@ -219,7 +219,7 @@ def identify_payload(arm: KnownArm, recorded: Equations, *, refit_offsets: bool 
         word = best if found[best].explains else "infeasible"
     body = found.get(word)
     moved = np.zeros(base.size) if word == "none" else fit.beta if body is None else body.b
-    everything = recorded.everything
+    everything = loaded_equations.everything
     payload = Payload(
         base=base,
         T=T,
@@ -231,7 +231,7 @@ def identify_payload(arm: KnownArm, recorded: Equations, *, refit_offsets: bool 
         verdicts=verdicts(fit.beta, deviations, _as_zero(motion, base, fit.beta)),
         blocks=blocks,
         test=test,
-        torque_share=motion.change(only) / np.maximum(measured, np.finfo(float).tiny),
+        torque_share=motion.torque_change(only) / np.maximum(measured, np.finfo(float).tiny),
         verdict=word,
         body=body,
         without=torque_error(everything, arm.beta),
@@ -291,7 +291,7 @@ def _as_zero(motion: Motion, base: BaseParameters, beta: Array) -> Array:
     mass = max(mass, _LEAST_MASS)
     near = {"kg m^2": mass * _ARM**2, "kg m": mass * _ARM, "kg": _LEAST_MASS}
     of_units = np.array([near.get(unit, np.inf) for unit in base.units])
-    changes = np.array([motion.change(one) for one in np.eye(base.size)])
+    changes = np.array([motion.torque_change(one) for one in np.eye(base.size)])
     shares = (changes / np.maximum(motion.torque, np.finfo(float).tiny)).max(axis=1)
     return np.asarray(np.minimum(of_units, RELEVANT_TORQUE / np.maximum(shares, np.finfo(float).tiny)))
 
@@ -329,7 +329,7 @@ def _body(
     metric = _metric(covariance)
     # The sign applies to the offsets too, and is undone below.
     found = nearest(metric, sign * metric @ b, sign * b, base, conditions, "payload")
-    p = probability(found.objective**2, max(whole.directions, 1), whole.degrees)
+    p = p_value(found.objective**2, max(whole.directions, 1), whole.degrees)
     delta = _compact(found.delta, base, conditions, near(found.beta))
     moved = sign * base.K @ delta
     rest = np.where(np.isfinite(np.diag(covariance)), b - moved, 0.0)

@@ -17,9 +17,9 @@ from ident_service.config.arm import JointTerm
 from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.identify import Candidate, Estimate
 from ident_service.estimation.least_squares import TorqueError, ordinary_least_squares, torque_error
-from ident_service.estimation.misread_columns import gains, misread_columns
+from ident_service.estimation.misread_columns import error_reductions, misread_columns
 from ident_service.estimation.misread_gravity import misread_gravity
-from ident_service.estimation.uncertainty import jackknife, widening
+from ident_service.estimation.uncertainty import jackknife, student_factors
 from ident_service.model.arm_model import ArmModel
 from ident_service.recordings.quality import JointQuality
 from ident_service.recordings.recording import Recording
@@ -87,7 +87,9 @@ def reasons_against(estimate: Estimate, recordings: Sequence[Recording] = ()) ->
     """
     names = estimate.model.chain.names
     misread, gravity = misread_columns(estimate, recordings), misread_gravity(estimate, recordings)
-    if gravity is not None and (misread is None or gravity.gained > float(gains(misread.before, misread.after).sum())):
+    if gravity is not None and (
+        misread is None or gravity.error_reduction > float(error_reductions(misread.before, misread.after).sum())
+    ):
         return (gravity.sentence(names),)
     if misread is not None:
         return (misread.sentence(names),)
@@ -99,7 +101,7 @@ def reasons_against(estimate: Estimate, recordings: Sequence[Recording] = ()) ->
     )
 
 
-def reasons_in_length(estimate: Estimate, seconds: float) -> tuple[str, ...]:
+def reasons_in_length(estimate: Estimate, motion_seconds: float) -> tuple[str, ...]:
     """Return a sentence if a motion is short and leaves too much unidentified; () if not, or if others validate it.
 
     A short motion that leaves much unidentified predicts itself and nothing else. Where other recordings validate the
@@ -107,10 +109,10 @@ def reasons_in_length(estimate: Estimate, seconds: float) -> tuple[str, ...]:
 
     Args:
         estimate: to judge.
-        seconds: total length of the fitted recordings [s].
+        motion_seconds: total length of the fitted recordings [s].
     """
     rows = estimate.prepared.equations.moving.rows
-    moved = seconds * float(rows.max(initial=0)) / max(estimate.samples, 1)
+    moved = motion_seconds * float(rows.max(initial=0)) / max(estimate.samples, 1)
     unknown, size = estimate.verdicts.count("unidentified"), estimate.base.size
     # Stribeck friction of a drive that is never slow has no effect.
     unseen = [
@@ -129,46 +131,54 @@ def reasons_in_length(estimate: Estimate, seconds: float) -> tuple[str, ...]:
     )
 
 
-def reasons_in_recording(recording: str, joints: Sequence[JointQuality], model: ArmModel) -> tuple[str, ...]:
+def reasons_in_recording(
+    recording_name: str, joint_qualities: Sequence[JointQuality], model: ArmModel
+) -> tuple[str, ...]:
     """Return sentences on why a recording cannot be of this arm in SI units; empty where nothing speaks against it.
 
     Args:
-        recording: name of the recording, for the words.
-        joints: quality of each joint's samples.
+        recording_name: name of the recording, for the words.
+        joint_qualities: quality of each joint's samples.
         model: the arm and its limits.
     """
     found = [
-        f"{recording}: {reason}"
-        for index, seen in enumerate(joints)
+        f"{recording_name}: {reason}"
+        for index, seen in enumerate(joint_qualities)
         for reason in _of_joint(model.chain.names[index], seen, model, revolute=model.chain.revolute[index])
     ]
-    together = (*_weight(joints, model), *_without_sign(joints), *_nearly_none(joints, model))
-    return (*found, *(f"{recording}: {reason}" for reason in together))
+    together = (
+        *_weight(joint_qualities, model),
+        *_without_sign(joint_qualities),
+        *_nearly_none(joint_qualities, model),
+    )
+    return (*found, *(f"{recording_name}: {reason}" for reason in together))
 
 
-def torque_missing(seen: JointQuality) -> bool:
+def torque_missing(joint_quality: JointQuality) -> bool:
     """Return whether a joint's torque never changes although the joint moves, so that it was not recorded."""
-    return seen.torque[0] == seen.torque[1] and seen.standstill < _AT_REST
+    return joint_quality.torque[0] == joint_quality.torque[1] and joint_quality.standstill < _AT_REST
 
 
-def wrapped(seen: JointQuality) -> bool:
+def wrapped(joint_quality: JointQuality) -> bool:
     """Return whether a joint's largest step is about one whole turn beside small ones: angles wrapped around."""
-    return abs(seen.largest_step - _TURN) < _ABOUT_A_TURN and seen.usual_step < _USUAL_OF_A_TURN * _TURN
+    return (
+        abs(joint_quality.largest_step - _TURN) < _ABOUT_A_TURN and joint_quality.usual_step < _USUAL_OF_A_TURN * _TURN
+    )
 
 
-def torque_clipped(estimate: Estimate, recordings: Sequence[Sequence[JointQuality]]) -> tuple[str, ...]:
+def torque_clipped(estimate: Estimate, joint_qualities: Sequence[Sequence[JointQuality]]) -> tuple[str, ...]:
     """Return a sentence per joint whose recorded torque stays at an extreme that the model misses: cut off there.
 
     Of a drive that gives its largest torque, what is recorded is its torque, and the model predicts it.
 
     Args:
         estimate: to judge.
-        recordings: quality of each joint's samples, per fitted recording.
+        joint_qualities: quality of each joint's samples, per fitted recording.
     """
     errors = estimate.candidates[estimate.chosen].moving.joint_relative_percent
     found = []
     for index, name in enumerate(estimate.model.chain.names):
-        seen = max((joints[index] for joints in recordings), key=lambda joint: joint.clipped)
+        seen = max((joints[index] for joints in joint_qualities), key=lambda joint: joint.clipped)
         if seen.clipped > _CLIPPED and errors[index] > _CLIPPED_ERROR:
             low, high = seen.torque
             found.append(
@@ -179,16 +189,16 @@ def torque_clipped(estimate: Estimate, recordings: Sequence[Sequence[JointQualit
     return tuple(found)
 
 
-def remarks_on_limits(recording: str, joints: Sequence[JointQuality], model: ArmModel) -> tuple[str, ...]:
+def remarks_on_limits(recording_name: str, joint_qualities: Sequence[JointQuality], model: ArmModel) -> tuple[str, ...]:
     """Return a remark per joint that leaves its position limits a little, by less than makes a recording unusable.
 
     Args:
-        recording: name of the recording, for the words.
-        joints: quality of each joint's samples.
+        recording_name: name of the recording, for the words.
+        joint_qualities: quality of each joint's samples.
         model: the arm and its limits.
     """
     found = []
-    for name, seen, revolute in zip(model.chain.names, joints, model.chain.revolute, strict=True):
+    for name, seen, revolute in zip(model.chain.names, joint_qualities, model.chain.revolute, strict=True):
         described = model.config.joints.get(name)
         limits = None if described is None else described.position
         if limits is None:
@@ -198,7 +208,7 @@ def remarks_on_limits(recording: str, joints: Sequence[JointQuality], model: Arm
         if _NOISE * span < excess <= _OUTSIDE * span:
             value, when = _farthest(seen, limits)
             found.append(
-                f"{recording}: {name} is at {value:.4g} {'rad' if revolute else 'm'} {when:.4g} s after the first"
+                f"{recording_name}: {name} is at {value:.4g} {'rad' if revolute else 'm'} {when:.4g} s after the first"
                 f" sample, outside its limits of {limits[0]:.4g} and {limits[1]:.4g}: correct the limits, or the offset"
             )
     return tuple(found)
@@ -326,7 +336,7 @@ def _driving_friction(estimate: Estimate, deviations: float) -> list[tuple[str, 
         return []
     rows = np.array([row for _, _, row in driving]).T
     covariance, degrees, blind = jackknife(estimate.fitted.clusters, estimate.fit, rows)
-    doubt = np.where(blind, np.inf, np.sqrt(np.diag(covariance)) * widening(degrees))
+    doubt = np.where(blind, np.inf, np.sqrt(np.diag(covariance)) * student_factors(degrees))
     return [
         (name, torque, float(deviation))
         for (name, torque, _), deviation in zip(driving, doubt, strict=True)

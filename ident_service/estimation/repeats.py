@@ -50,10 +50,10 @@ class Stretches:
     first: int = 0
     recording: int = 0
 
-    def label(self, number: int) -> Label:
+    def label(self, stretch_number: int) -> Label:
         """Return the label of the stretch with this number, equal for repeats of a motion; a unique one if unknown."""
-        place = number - self.first
-        return self.labels[place] if 0 <= place < len(self.labels) else (self.recording, number)
+        place = stretch_number - self.first
+        return self.labels[place] if 0 <= place < len(self.labels) else (self.recording, stretch_number)
 
 
 @dataclass(frozen=True)
@@ -97,19 +97,19 @@ class _Motion:
 
 def stretches(
     recordings: Sequence[Recording],
-    lengths: Sequence[float],
+    stretch_seconds: Sequence[float],
     fmt: RecordingFormat | None = None,
     *,
-    phases: int = 12,
+    stretches_per_period: int = 12,
 ) -> tuple[Stretches, ...]:
     """Divide each recording into stretches of time, labelled alike where they show the same motion.
 
     Args:
         recordings: of one arm.
-        lengths: length of the stretches of each recording [s]; what repeats is cut into whole parts of about the same
-            length.
+        stretch_seconds: length of the stretches of each recording [s]; what repeats is cut into whole parts of
+            about the same length.
         fmt: what to trim, what a gap is, and the rate; the defaults when None.
-        phases: least number of stretches in a period.
+        stretches_per_period: least number of stretches in a period.
 
     Raises:
         RecordingError: a recording cannot be read.
@@ -126,10 +126,10 @@ def stretches(
             if offset is not None:
                 break
         else:
-            motion, offset = _motion(positions, period, lengths[index], len(motions), phases), 0.0
+            motion, offset = _motion(positions, period, stretch_seconds[index], len(motions), stretches_per_period), 0.0
             motions.append(motion)
             if period is None and len(recordings) == 1:
-                return (Stretches(lengths[index]),)
+                return (Stretches(stretch_seconds[index]),)
         found[index] = _cut(positions, motion, offset, index)
     return tuple(found[index] for index in range(len(seen)))
 

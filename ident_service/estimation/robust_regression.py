@@ -22,8 +22,8 @@ from ident_service.estimation.equations import Equations, Rows, equation_rows, e
 from ident_service.estimation.least_squares import (
     LeastSquares,
     Moments,
-    least_deviations,
     ordinary_least_squares,
+    residual_deviation_floors,
     weighted_least_squares,
 )
 from ident_service.model.arm_model import ArmModel
@@ -49,7 +49,7 @@ def huber(
     base: BaseParameters,
     start: LeastSquares,
     torque_scales: Array | None = None,
-    shares: Array | None = None,
+    standstill_factors: Array | None = None,
     spread: SpreadRows | None = None,
 ) -> tuple[LeastSquares, Equations, float]:
     """Return Huber's estimate of the round that changed least, its reweighted equations, and that change [deviations].
@@ -63,20 +63,20 @@ def huber(
         base: grouping of the parameters.
         start: an estimate to begin from.
         torque_scales: factor of each joint's measured torque, shape (joints,); ones when None.
-        shares: factors of the rows near standstill, shape (joints,); ones when None.
+        standstill_factors: factors of the rows near standstill, shape (joints,); ones when None.
         spread: `spread_rows` of these, where they have been read already.
 
     Raises:
         RecordingError: a recording cannot be used.
     """
-    shares = np.ones(model.chain.joints) if shares is None else shares
+    standstill_factors = np.ones(model.chain.joints) if standstill_factors is None else standstill_factors
     times = np.ones(model.chain.joints) if torque_scales is None else torque_scales
-    spread = spread_rows(recordings, model, base, times, shares) if spread is None else spread
+    spread = spread_rows(recordings, model, base, times, standstill_factors) if spread is None else spread
     beta, change = spread.huber(start.beta, _MOST_ROUNDS)
     scales = spread.scales(beta)
 
     def weights(rows: Rows) -> Array:
-        count = np.where(rows.keep, 1.0, shares)
+        count = np.where(rows.keep, 1.0, standstill_factors)
         residuals = count * (rows.torque * times - np.einsum("jps,p->sj", rows.H_b, beta))
         return np.asarray(count * _weights(residuals, scales))
 
@@ -119,10 +119,10 @@ class SpreadRows:
     base: int
     tables: tuple[Array, ...]
 
-    def huber(self, beta: Array, rounds: int) -> tuple[Array, float]:
-        """Reweight for up to `rounds` rounds; return the estimate that changed least, and its change in deviations."""
+    def huber(self, beta: Array, most_rounds: int) -> tuple[Array, float]:
+        """Reweight up to `most_rounds` times; return the estimate that changed least, and that change [deviations]."""
         best = (beta, np.inf)
-        for _ in range(rounds):
+        for _ in range(most_rounds):
             better, deviations = self._reweighted(beta).estimate()
             change = float(np.max(np.abs(better - beta) / np.maximum(deviations, np.finfo(float).tiny)))
             if change < best[1]:
@@ -140,15 +140,15 @@ class SpreadRows:
         """Return per joint the sum of squared residuals, shape (joints,)."""
         return np.array([float(one @ one) for one in self.residuals(beta)])
 
-    def only(self, part: int) -> SpreadRows:
-        """Return the rows of the third with number `part`, from 0."""
-        return self._with([np.array_split(table, _FOLDS)[part] for table in self.tables])
+    def only(self, third: int) -> SpreadRows:
+        """Return the rows of the third with number `third`, from 0."""
+        return self._with([np.array_split(table, _FOLDS)[third] for table in self.tables])
 
-    def without(self, part: int) -> SpreadRows:
-        """Return the rows of the thirds other than number `part`, from 0."""
+    def without(self, third: int) -> SpreadRows:
+        """Return the rows of the thirds other than number `third`, from 0."""
         return self._with(
             [
-                np.concatenate([one for number, one in enumerate(np.array_split(table, _FOLDS)) if number != part])
+                np.concatenate([one for number, one in enumerate(np.array_split(table, _FOLDS)) if number != third])
                 for table in self.tables
             ]
         )
@@ -179,9 +179,13 @@ class SpreadRows:
 
 
 def spread_rows(
-    recordings: Sequence[Recording], model: ArmModel, base: BaseParameters, torque_scales: Array, shares: Array
+    recordings: Sequence[Recording],
+    model: ArmModel,
+    base: BaseParameters,
+    torque_scales: Array,
+    standstill_factors: Array,
 ) -> SpreadRows:
-    """Return recordings' rows, thinned if many; torques times `torque_scales`, rows near standstill times `shares`.
+    """Return recordings' rows, thinned if many, torques and rows near standstill multiplied by the given factors.
 
     Raises:
         RecordingError: a recording cannot be used.
@@ -193,7 +197,7 @@ def spread_rows(
         for rows in equation_rows(recording, model, base):
             picked = np.arange((-seen) % every, len(rows.time), every)
             seen += len(rows.time)
-            count = np.where(rows.keep[picked], 1.0, shares)
+            count = np.where(rows.keep[picked], 1.0, standstill_factors)
             torque = rows.torque[picked] * torque_scales
             kept.append(
                 tuple(
@@ -228,7 +232,7 @@ def standstill_weights(gathered: Equations) -> Array:
     if near is None or not near.rows.any():
         return shares
     beta = weighted_least_squares(gathered.everything).beta
-    floor = least_deviations(gathered.everything)
+    floor = residual_deviation_floors(gathered.everything)
     for _ in range(_MOST_WEIGHINGS):
         fast, slow = (np.maximum(_deviations(part, beta), floor) for part in (moving, near))
         # A joint whose rows are all of one kind has nothing to compare.

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident_service.estimation.equations import Rows, equation_rows, equations_of
-from ident_service.estimation.friction_fit import searched, with_friction
+from ident_service.estimation.friction_fit import log_deviation_of_search_range, with_friction
 from ident_service.estimation.least_squares import ordinary_least_squares, unit_columns
-from ident_service.estimation.uncertainty import jackknife, widening
+from ident_service.estimation.uncertainty import jackknife, student_factors
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
@@ -49,7 +49,7 @@ class ShapeUncertainty:
     degrees: Array
     known_degrees: Array
 
-    def joined(self, deviations: Array, degrees: Array) -> tuple[Array, Array]:
+    def joined(self, deviations: Array, degrees_of_freedom: Array) -> tuple[Array, Array]:
         """Return deviations widened by the friction shape's uncertainty, and the degrees of freedom of both together.
 
         Each part is widened for its own degrees of freedom, none of which is more than the deviations have: beyond
@@ -58,16 +58,16 @@ class ShapeUncertainty:
 
         Args:
             deviations: standard deviations that take the shape for known, widened, shape (base,); may be infinite.
-            degrees: degrees of freedom of the deviations, shape (base,).
+            degrees_of_freedom: degrees of freedom of the deviations, shape (base,).
         """
-        own, added = np.minimum(degrees, self.known_degrees), np.minimum(degrees, self.degrees)
-        variances = (deviations / widening(degrees)) ** 2, np.diag(self.covariance)
+        own, added = np.minimum(degrees_of_freedom, self.known_degrees), np.minimum(degrees_of_freedom, self.degrees)
+        variances = (deviations / student_factors(degrees_of_freedom)) ** 2, np.diag(self.covariance)
         both = variances[0] + variances[1]
         share = np.divide(variances[1], both, out=np.zeros_like(both), where=np.isfinite(both) & (both > 0.0))
-        wider = np.sqrt(variances[0] * widening(own) ** 2 + variances[1] * widening(added) ** 2)
+        wider = np.sqrt(variances[0] * student_factors(own) ** 2 + variances[1] * student_factors(added) ** 2)
         # What no equation sees has no degrees of freedom at all.
         own, added = (np.maximum(one, np.finfo(float).tiny) for one in (own, added))
-        return wider, np.minimum(degrees, 1.0 / ((1.0 - share) ** 2 / own + share**2 / added))
+        return wider, np.minimum(degrees_of_freedom, 1.0 / ((1.0 - share) ** 2 / own + share**2 / added))
 
 
 def shape_uncertainty(
@@ -78,7 +78,7 @@ def shape_uncertainty(
     beta: Array,
     weights: Array,
     torque_scales: Array,
-    shares: Array,
+    standstill_factors: Array,
 ) -> ShapeUncertainty:
     """Return the covariance that the uncertainty of the fitted friction shape adds to that of base parameters.
 
@@ -90,7 +90,7 @@ def shape_uncertainty(
         beta: base parameters, shape (base,).
         weights: per joint, what its equations are multiplied by, shape (joints,).
         torque_scales: factor of each joint's measured torque, shape (joints,).
-        shares: factors of the rows near standstill, shape (joints,).
+        standstill_factors: factors of the rows near standstill, shape (joints,).
 
     Raises:
         RecordingError: a recording cannot be used.
@@ -117,7 +117,11 @@ def shape_uncertainty(
         np.concatenate([support, size + further[np.tile(model.chain.coupling[:, joint] != 0.0, len(fitted))]])
         for joint, support in enumerate(sparsity(model.chain, model.layout, base.base))
     )
-    gathered = equations_of(recordings, model, felt, rows_of).with_torques_times(torque_scales).with_near(shares)
+    gathered = (
+        equations_of(recordings, model, felt, rows_of)
+        .with_torques_times(torque_scales)
+        .with_standstill_rows(standstill_factors)
+    )
     fit = ordinary_least_squares(gathered.total, weights)
     W, D = fit.R1[:, :size], fit.R1[:, size:]
     # A number that was left out, or belongs to friction that is not there, moves nothing.
@@ -127,7 +131,7 @@ def shape_uncertainty(
         return none
     scale, _ = unit_columns(W)
     follow = -np.linalg.lstsq(W / scale, D[:, used], rcond=_RANK_TOLERANCE)[0] / scale[:, None]
-    most = np.repeat([searched(key) for key in fitted], drives)[used]
+    most = np.repeat([log_deviation_of_search_range(key) for key in fitted], drives)[used]
     numbers = np.eye(len(seen))[:, size:][:, used]
     found, _, blind = jackknife(gathered.clusters, fit, numbers)
     told, white = np.sqrt(np.diag(found)), np.where(blind, 0.0, fit.standard_deviations[size:][used])

@@ -336,7 +336,7 @@ class Averaged:
 def averaged(
     recording: Recording,
     options: Identification,
-    period: float,
+    motion_period: float,
     coupling: Array | None = None,
     fmt: RecordingFormat | None = None,
 ) -> Averaged:
@@ -345,7 +345,7 @@ def averaged(
     Args:
         recording: recording of a periodic motion; whatever is not periodic (approach, return) is trimmed by `fmt`.
         options: cut-off and rows near reversal.
-        period: of the motion [s].
+        motion_period: of the motion [s].
         coupling: drive coordinates per joint coordinates; the identity when None.
         fmt: what to trim and the rate.
 
@@ -357,15 +357,16 @@ def averaged(
     options = with_filter([recording], options, fmt)
     stamps = grid(recording, fmt)
     step = stamps.period_s
-    length = max(round(period / step), 1)
+    length = max(round(motion_period / step), 1)
     # The first and the last sample count both: n periods end one step before the next one would begin.
     total = (round((stamps.last_ns - stamps.first_ns) * 1e-9 / step) + 1) // length
     if total < 2:
-        raise RecordingError(recording.path, f"holds {total} whole periods of {period:g} s; averaging needs two")
-    if abs(period / step - length) * total > max(_WHOLE * length, 0.5):
+        raise RecordingError(recording.path, f"holds {total} whole periods of {motion_period:g} s; averaging needs two")
+    if abs(motion_period / step - length) * total > max(_WHOLE * length, 0.5):
         raise RecordingError(
             recording.path,
-            f"a period of {period:g} s is {period / step:.3f} samples; set recording.rate to a whole number of them",
+            f"a period of {motion_period:g} s is {motion_period / step:.3f} samples; "
+            "set recording.rate to a whole number of them",
         )
     counts = np.zeros(length)
     sums = np.zeros((4, length, recording.joints))
@@ -388,7 +389,7 @@ def averaged(
         joint = int(np.argmax(spread_q / np.maximum(swing, 1e-6)))
         raise RecordingError(
             recording.path,
-            f"joint {joint + 1} differs by {spread_q[joint]:.3g} between periods of {period:g} s; "
+            f"joint {joint + 1} differs by {spread_q[joint]:.3g} between periods of {motion_period:g} s; "
             "trim approach and return with recording.trim, or correct identification.period",
         )
     motion = _motion(mean_q, mean_tau, recording.torque_zero_order_hold, options, step, coupling)

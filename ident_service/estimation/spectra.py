@@ -74,7 +74,7 @@ def with_filter(
     if "choose" not in (smoothing.cutoff, smoothing.decimate, options.edge):
         return options
     if smoothing.cutoff == "choose":
-        seen = [spectrum(recording, fmt, measured=smoothing.velocity == "measured") for recording in recordings]
+        seen = [spectrum(recording, fmt, from_velocities=smoothing.velocity == "measured") for recording in recordings]
         cutoff, rate = float(f"{max(one.cutoff for one in seen):.2g}"), min(one.rate for one in seen)
     else:
         cutoff, rate = smoothing.cutoff, min(1.0 / grid(recording, fmt).period_s for recording in recordings)
@@ -108,7 +108,7 @@ def remarks_on_noise(recordings: Sequence[Recording], model: ArmModel) -> tuple[
         return ()
     cutoff, found = float(options.smoothing.cutoff), []
     for recording in recordings:
-        noise = spectrum(recording, fmt, measured=options.smoothing.velocity == "measured").noise
+        noise = spectrum(recording, fmt, from_velocities=options.smoothing.velocity == "measured").noise
         if cutoff > _ROUNDED * noise:
             found.append(
                 f"{recording.path.name}: noise of the positions is more than 3 % of the accelerations from"
@@ -119,7 +119,7 @@ def remarks_on_noise(recordings: Sequence[Recording], model: ArmModel) -> tuple[
     return tuple(found)
 
 
-def spectrum(recording: Recording, fmt: RecordingFormat, *, measured: bool = False) -> Spectrum:
+def spectrum(recording: Recording, fmt: RecordingFormat, *, from_velocities: bool = False) -> Spectrum:
     """Return the frequencies [Hz] where motion ends and noise begins in a recording's positions, kept for reuse.
 
     A recording that has a memory keeps it: the choice of the filter and remarks on noise ask for the same.
@@ -127,15 +127,15 @@ def spectrum(recording: Recording, fmt: RecordingFormat, *, measured: bool = Fal
     Args:
         recording: to look at.
         fmt: what to trim, what a gap is, and the rate.
-        measured: whether to look at its velocities instead, as far as it has any.
+        from_velocities: whether to look at its velocities instead, as far as it has any.
 
     Raises:
         RecordingError: it cannot be read.
     """
-    memory, key = memory_of(recording), (fmt, measured)
+    memory, key = memory_of(recording), (fmt, from_velocities)
     if memory is not None and (found := memory.recall("spectrum", key)) is not None:
         return cast("Spectrum", found)
-    seen = _spectrum(recording, fmt, measured)
+    seen = _spectrum(recording, fmt, from_velocities)
     if memory is not None:
         memory.remember("spectrum", key, seen)
     return seen

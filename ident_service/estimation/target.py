@@ -38,7 +38,7 @@ class Target:
     share: float
     parameters: tuple[str, ...] = ()
 
-    def places(self, base: BaseParameters, arm: str) -> NDArray[np.intp]:
+    def base_indices(self, base: BaseParameters, arm_name: str) -> NDArray[np.intp]:
         """Return the indices of base parameters that the target names, all if none; raises UsageError for unknown ones.
 
         Raises:
@@ -47,15 +47,18 @@ class Target:
         known = {expression.replace(" ", ""): place for place, expression in enumerate(base.expressions)}
         if unknown := [name for name in self.parameters if name.replace(" ", "") not in known]:
             raise UsageError(
-                f"{', '.join(unknown)}: not among the base parameters of {arm}; `ident base-parameters` prints them"
+                f"{', '.join(unknown)}: not among the base parameters of {arm_name}; "
+                "`ident base-parameters` prints them"
             )
         chosen = [known[name.replace(" ", "")] for name in self.parameters] or list(range(base.size))
         return np.array(chosen, dtype=np.intp)
 
 
-def worst_share(doubt: ParameterUncertainty, places: NDArray[np.intp]) -> float:
+def worst_relative_deviation(uncertainty: ParameterUncertainty, base_indices: NDArray[np.intp]) -> float:
     """Return the largest relative deviation of the chosen parameters; infinite while blocks are under 10."""
-    if doubt.blocks < LEAST_BLOCKS:
+    if uncertainty.blocks < LEAST_BLOCKS:
         return np.inf
-    worst = float(relative_deviations(doubt.beta, doubt.deviations, doubt.negligible)[places].max())
+    worst = float(
+        relative_deviations(uncertainty.beta, uncertainty.deviations, uncertainty.negligible)[base_indices].max()
+    )
     return worst if np.isfinite(worst) else np.inf

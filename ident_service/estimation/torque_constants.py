@@ -180,7 +180,7 @@ def _motor_equations(recordings: Sequence[Recording], model: ArmModel, base: Bas
 
     found = equations_of(recordings, model, felt, rows_of)
     # Where the motion reverses too often for any rows in motion, all rows count.
-    return found if found.total.rows.all() else found.with_near(np.ones(len(to_motors)))
+    return found if found.total.rows.all() else found.with_standstill_rows(np.ones(len(to_motors)))
 
 
 @dataclass(frozen=True)

@@ -49,9 +49,9 @@ class Delay:
     deviation: float
 
 
-def with_delay(model: ArmModel, seconds: float) -> ArmModel:
-    """Return the model with `seconds` as its delay: recorded torque is taken to be stamped that much too late."""
-    return model.with_options(delay=seconds)
+def with_delay(model: ArmModel, delay_seconds: float) -> ArmModel:
+    """Return the model with `delay_seconds` as its delay: recorded torque is taken to be stamped that much too late."""
+    return model.with_options(delay=delay_seconds)
 
 
 def estimate_delay(recordings: Sequence[Recording], model: ArmModel, base: BaseParameters) -> Delay:
@@ -88,7 +88,7 @@ def estimate_delay(recordings: Sequence[Recording], model: ArmModel, base: BaseP
 
 
 def choose_delay(
-    trials_at: Callable[[float], FrictionTrials], period: float, base: BaseParameters, conditions: FeasibleSet
+    trials_at: Callable[[float], FrictionTrials], sample_period: float, base: BaseParameters, conditions: FeasibleSet
 ) -> tuple[float, Choice | None]:
     """Return the delay [s] of least held-out error, 0.0 unless one is clearly better, and the choice or None.
 
@@ -97,7 +97,7 @@ def choose_delay(
     Args:
         trials_at: function that returns rows of the fitted recordings, for a torque that is stamped too late by its
             argument [s].
-        period: of their samples [s].
+        sample_period: of their samples [s].
         base: grouping of the parameters.
         conditions: feasible set that constrains the estimates.
 
@@ -105,7 +105,7 @@ def choose_delay(
         The delay [s], and how it was chosen; None where a joint does not move in every third. Zero where it would be
         more than 0.2 s, so that the channels do not belong together.
     """
-    step = max(period, _STEP)
+    step = max(sample_period, _STEP)
     seconds, first = _choose_near(trials_at(0.0), step, base, conditions)
     last, moved = first, seconds
     while last is not None and abs(moved) == _STEPS * step:

@@ -86,14 +86,14 @@ def uncertainty(equations: Equations, fit: LeastSquares) -> Uncertainty:
     scale = np.where(known, floor / np.where(known, deviations, 1.0), 1.0)
     covariance = covariance * np.outer(scale, scale)
     covariance[blind, blind] = np.inf
-    largest = floor * widening(degrees)
+    largest = floor * student_factors(degrees)
     # Errors of the model last longer than a block where a joint is slow.
     for count in _LONGER:
         if len(clusters) < _LEAST_CLUSTERS * count:
             break
         longer = [_Whitened.sum(seen[start : start + count]) for start in range(0, len(seen), count)]
         other, fewer, _ = _left_out(longer, fit, np.eye(len(fit.beta)))
-        found = np.sqrt(np.diag(other)) * widening(fewer)
+        found = np.sqrt(np.diag(other)) * student_factors(fewer)
         degrees = np.where(found > largest, fewer, degrees)
         largest = np.maximum(largest, found)
     inflation = _inflation(seen, _white_variance(equations, fit))
@@ -142,22 +142,22 @@ def _inflation(seen: Sequence[_Whitened], variance: float) -> float:
 
 
 def jackknife(
-    clusters: Sequence[Sequence[Information]], fit: LeastSquares, along: Array | None = None
+    clusters: Sequence[Sequence[Information]], fit: LeastSquares, parameter_combinations: Array | None = None
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Return covariance, degrees of freedom and a mask of the unseen, leaving out one cluster at a time (HC3).
 
     Args:
         clusters: clusters of blocks; each cluster counts as one piece of evidence.
         fit: least squares that solves all of them.
-        along: combinations of the parameters, shape (base, combinations); each parameter alone when None. The
-            covariance of few blocks says nothing about combinations, as it knows most of them far too well: their
-            degrees of freedom must be asked for with them.
+        parameter_combinations: combinations of the parameters, shape (base, combinations); each parameter alone when
+            None. The covariance of few blocks says nothing about combinations, as it knows most of them far too well:
+            their degrees of freedom must be asked for with them.
 
     Returns:
         The covariance of the combinations, shape (combinations, combinations); degrees of freedom of its variances,
         shape (combinations,); and of which of them the data, or all clusters but one, say nothing.
     """
-    combinations = np.eye(len(fit.beta)) if along is None else along
+    combinations = np.eye(len(fit.beta)) if parameter_combinations is None else parameter_combinations
     return _left_out([_Whitened.of(cluster, fit) for cluster in clusters], fit, combinations)
 
 
@@ -252,15 +252,15 @@ def _noise(clusters: Sequence[Sequence[Information]], fit: LeastSquares) -> Arra
     return np.diag(bread @ differing @ bread).copy()
 
 
-def widening(degrees: Array) -> Array:
+def student_factors(degrees_of_freedom: Array) -> Array:
     """Return the factor per parameter by which 1.96 deviations become 95 % of Student's t, shape (base,).
 
     Args:
-        degrees: degrees of freedom, shape (base,).
+        degrees_of_freedom: degrees of freedom, shape (base,).
     """
     from scipy.special import stdtrit  # loads for 0.2 s, and a run without a target judges nothing
 
-    return np.asarray(stdtrit(np.maximum(degrees, 1.0), 0.975) / _NORMAL)
+    return np.asarray(stdtrit(np.maximum(degrees_of_freedom, 1.0), 0.975) / _NORMAL)
 
 
 def _degrees(lengths: Array, images: Array) -> Array:
@@ -298,7 +298,7 @@ def negligible(information: Information) -> Array:
     return size
 
 
-def verdicts(beta: Array, deviations: Array, as_zero: Array) -> tuple[Verdict, ...]:
+def verdicts(beta: Array, deviations: Array, negligible_sizes: Array) -> tuple[Verdict, ...]:
     """Return per parameter `identified`, `weak` or `unidentified`, by its deviation relative to its size.
 
     Its size counts as at least what is as good as zero.
@@ -306,16 +306,16 @@ def verdicts(beta: Array, deviations: Array, as_zero: Array) -> tuple[Verdict, .
     Args:
         beta: parameters, shape (base,).
         deviations: standard deviations of the parameters, shape (base,).
-        as_zero: sizes below which parameters are as good as zero, shape (base,), see `negligible`.
+        negligible_sizes: sizes below which parameters are as good as zero, shape (base,), see `negligible`.
     """
     return tuple(
         "identified" if share < IDENTIFIED_BELOW else "weak" if share < WEAK_BELOW else "unidentified"
-        for share in relative_deviations(beta, deviations, as_zero)
+        for share in relative_deviations(beta, deviations, negligible_sizes)
     )
 
 
-def relative_deviations(beta: Array, deviations: Array, as_zero: Array) -> Array:
-    """Return each deviation over the larger of the parameter's magnitude and `as_zero`; infinite where unseen."""
-    sizes = np.maximum(np.maximum(np.abs(beta), as_zero), np.finfo(float).tiny)
+def relative_deviations(beta: Array, deviations: Array, negligible_sizes: Array) -> Array:
+    """Return each deviation over the larger of the parameter's magnitude and negligible size; infinite where unseen."""
+    sizes = np.maximum(np.maximum(np.abs(beta), negligible_sizes), np.finfo(float).tiny)
     # Parameters that no joint feels have infinite negligible sizes.
     return np.where(np.isfinite(deviations), deviations, np.inf) / np.where(np.isfinite(sizes), sizes, 1.0)

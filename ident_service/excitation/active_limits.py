@@ -55,15 +55,15 @@ class ActiveLimit:
     by_gain: float = 0.0
 
 
-def binding(task: Task, coefficients: Array, per_period: int) -> tuple[ActiveLimit, ...]:
+def active_limits(task: Task, coefficients: Array, samples_per_period: int) -> tuple[ActiveLimit, ...]:
     """Return the limits that a motion reaches and whose relaxing would gain something; the largest gain first.
 
     Args:
         task: task of the search.
         coefficients: coefficients of the motion, shape (joints, size).
-        per_period: samples per period.
+        samples_per_period: samples per period.
     """
-    problem = Problem(task, per_period)
+    problem = Problem(task, samples_per_period)
     x = problem.variables(coefficients)
     state, sharpness = problem.state(x, 64.0), 64.0
     none = problem.no_multipliers(1.0)
@@ -109,42 +109,42 @@ def forces_of(slopes: Array, pull: Array) -> Array:
     return np.asarray(np.maximum(found.x, 0.0))
 
 
-def needed_stiffness(task: Task, coefficients: Array, per_period: int) -> Array:
+def needed_stiffness(task: Task, coefficients: Array, samples_per_period: int) -> Array:
     """Return needed over present stiffness of each joint, to follow at its velocity limit, shape (joints,).
 
     Args:
         task: task of the search.
         coefficients: coefficients of a motion whose postures the arm has to reach, shape (joints, size).
-        per_period: samples per period.
+        samples_per_period: samples per period.
     """
-    problem = Problem(task, per_period)
+    problem = Problem(task, samples_per_period)
     return problem.error_at_velocity_limit(problem.variables(coefficients)) / (USABLE * task.limits.following_error)
 
 
 def active_limit_lines(
-    found: Sequence[ActiveLimit],
+    active_limits: Sequence[ActiveLimit],
     task: Task,
     limits: MotionLimits,
-    velocity: Array,
-    lengths: Sequence[str],
-    gains: Mapping[int, str] | None = None,
+    largest_velocity: Array,
+    position_units: Sequence[str],
+    proposed_gains: Mapping[int, str] | None = None,
 ) -> list[str]:
     """Return lines for people: the limits that hold a motion back, what relaxing each gains, and stiffer kp and kd.
 
     Args:
-        found: the limits.
+        active_limits: the limits.
         task: task of the search.
         limits: limits of the arm, margins included.
-        velocity: largest velocity of the motion [rad/s or m/s], shape (joints,).
-        lengths: unit of each joint's position.
-        gains: proposals of `stiffer_gains`, by joint.
+        largest_velocity: largest velocity of the motion [rad/s or m/s], shape (joints,).
+        position_units: unit of each joint's position.
+        proposed_gains: proposals of `stiffer_gains`, by joint.
     """
     names, lines = task.model.chain.names, []
-    left = dict(gains or {})
-    for one in found[:_MOST_LISTED]:
+    left = dict(proposed_gains or {})
+    for one in active_limits[:_MOST_LISTED]:
         if one.exponent < _WORTH_TELLING:
             break
-        gain = f"could give up to about {gain_words(task.criterion, 2.0**one.exponent)}"
+        gain = f"could give up to about {improvement_words(task.criterion, 2.0**one.exponent)}"
         if one.joint is None:
             what = "the supply's power" if one.limit == "power" else "clearance"
             # Clearance is scaled by a depth, so that the gain for twice the limit has no meaning.
@@ -152,10 +152,9 @@ def active_limit_lines(
             continue
         name, k = names[one.joint], one.joint
         if one.limit == "following error":
-            share, allowed = velocity[k] / limits.velocity[k], 2.0 * limits.following_error[k]
-            line = (
-                f"{name} is limited to {share:.0%} of its velocity by following_error; {allowed:g} {lengths[k]} {gain}"
-            )
+            share, allowed = largest_velocity[k] / limits.velocity[k], 2.0 * limits.following_error[k]
+            twice = f"{allowed:g} {position_units[k]}"
+            line = f"{name} is limited to {share:.0%} of its velocity by following_error; {twice} {gain}"
         elif one.limit == "position":
             line = f"{name} is limited by its position range; twice the range {gain}"
         else:
@@ -166,30 +165,30 @@ def active_limit_lines(
 
 
 def stiffer_gains(
-    found: Sequence[ActiveLimit],
-    late: NDArray[np.bool_],
-    needed: Array,
+    active_limits: Sequence[ActiveLimit],
+    lagging: NDArray[np.bool_],
+    stiffness_factors: Array,
     limits: MotionLimits,
     stable: Callable[[Array, Array], bool],
 ) -> dict[int, str]:
     """Return phrases, by joint index, on stiffer kp and kd where following holds back, stable all together.
 
     Args:
-        found: the limits.
-        late: joints that a simulated arm moves too far off their references, shape (joints,).
-        needed: needed stiffness over the present one, from `needed_stiffness`, shape (joints,).
+        active_limits: the limits.
+        lagging: joints that a simulated arm moves too far off their references, shape (joints,).
+        stiffness_factors: needed stiffness over the present one, from `needed_stiffness`, shape (joints,).
         limits: limits of the arm, with its present gains.
         stable: function that judges gains kp and kd, each of shape (joints,).
     """
-    pays = 1.0 * late
-    for one in found:
+    pays = 1.0 * lagging
+    for one in active_limits:
         if one.joint is not None:
             pays[one.joint] += one.by_gain
     kp, kd, words = limits.kp, limits.kd, {}
     for k in np.argsort(-pays, kind="stable").tolist():
-        if pays[k] < _WORTH_TELLING or needed[k] <= _NOT_WORTH_IT:
+        if pays[k] < _WORTH_TELLING or stiffness_factors[k] <= _NOT_WORTH_IT:
             continue
-        wanted, low, high = float(needed[k]), 1.0, float(needed[k])
+        wanted, low, high = float(stiffness_factors[k]), 1.0, float(stiffness_factors[k])
         for halving in range(_HALVINGS + 1):
             times = wanted if halving == 0 else float(np.sqrt(low * high))
             factor = np.where(np.arange(len(kp)) == k, times, 1.0)
@@ -209,7 +208,7 @@ def stiffer_gains(
     return words
 
 
-def gain_words(criterion: Criterion, factor: float) -> str:
+def improvement_words(criterion: Criterion, factor: float) -> str:
     """Return words for a factor of a criterion's gain: more information, smaller variances or condition number."""
     if criterion == "d_optimal":
         more = f"{factor:.2g} times the" if factor >= _MUCH else f"{factor - 1.0:.0%} more"

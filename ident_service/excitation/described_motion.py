@@ -9,7 +9,7 @@ import numpy as np
 from ident_service.config.arm import FourierMotion, SeededMotion
 from ident_service.config.motion_limits import MotionLimits, motion_limits
 from ident_service.errors import MotionRefused
-from ident_service.excitation.limit_proof import demands, require_within_limits
+from ident_service.excitation.limit_proof import peak_bounds, require_within_limits
 from ident_service.excitation.motion_file import Excitation
 from ident_service.excitation.trajectory import FourierPath, FourierSeries
 from ident_service.model.arm_model import ArmModel
@@ -50,7 +50,7 @@ def _seeded(motion: SeededMotion, model: ArmModel, limits: MotionLimits) -> Four
     shape = (model.chain.joints, motion.harmonics)
     middle = limits.home if motion.about == "home" else 0.5 * (limits.lower + limits.upper)
     series = FourierSeries(motion.base_frequency, rng.normal(size=shape), rng.normal(size=shape), middle)
-    asked = demands(FourierPath(series, 1, motion.ramp), model)
+    asked = peak_bounds(FourierPath(series, 1, motion.ramp), model)
     room = np.minimum(limits.upper - middle, middle - limits.lower)
     used = np.max(
         [
@@ -65,7 +65,7 @@ def _seeded(motion: SeededMotion, model: ArmModel, limits: MotionLimits) -> Four
     series = FourierSeries(motion.base_frequency, series.a * factor, series.b * factor, middle)
     most = motion.use if motion.about == "middle" else max(motion.use, _HELD)
     for _ in range(20):
-        asked = demands(FourierPath(series, 1, motion.ramp), model)
+        asked = peak_bounds(FourierPath(series, 1, motion.ramp), model)
         torque, motors = asked.torque, asked.motors
         if (torque is None or bool(np.all(torque <= most * limits.torque))) and (
             motors is None or limits.motors is None or bool(np.all(motors <= most * limits.motors.torque))

@@ -20,12 +20,12 @@ from ident_service.errors import MotionRefused, UsageError
 from ident_service.excitation.active_limits import (
     ActiveLimit,
     active_limit_lines,
-    binding,
-    gain_words,
+    active_limits,
+    improvement_words,
     needed_stiffness,
     stiffer_gains,
 )
-from ident_service.excitation.limit_proof import Proof, demands, proof_of, scale_to_verified, tightened, violations
+from ident_service.excitation.limit_proof import Proof, peak_bounds, proof_of, scale_to_verified, tightened, violations
 from ident_service.excitation.motion_file import LONGEST, Excitation
 from ident_service.excitation.optimal_design import Task, condition_number, criterion, usable_limits
 from ident_service.excitation.prediction import (
@@ -189,8 +189,8 @@ class Prover:
     def prove_best(
         self,
         candidates: Sequence[Candidate],
-        per_period: int,
-        seconds: float | None,
+        samples_per_period: int,
+        search_seconds: float | None,
         cancelled: Callable[[], bool],
         best: Attempt | None = None,
         task: Task | None = None,
@@ -200,8 +200,8 @@ class Prover:
         Args:
             candidates: candidates of the search. Their values are of a smoothed criterion; the exact one, used here,
                 may rank them otherwise.
-            per_period: samples per period with which the search goes on.
-            seconds: time for searching on, proofs not counted [s]; no bound when None.
+            samples_per_period: samples per period with which the search goes on.
+            search_seconds: time for searching on, proofs not counted [s]; no bound when None.
             cancelled: called at every evaluation; True ends searching on.
             best: an earlier attempt.
             task: task of the search that found the candidates; the task of all proofs when None.
@@ -215,9 +215,9 @@ class Prover:
         for value, place in ranked:
             if best is not None and value >= best.value:
                 break  # even without the loss that a proof may cost it is no better
-            each = None if seconds is None else seconds / _ROUNDS
-            tries = self._searched_on(task, candidates[place], per_period, each, cancelled)
-            seconds = 0.0  # for one candidate: the others are there to be made smaller
+            each = None if search_seconds is None else search_seconds / _ROUNDS
+            tries = self._searched_on(task, candidates[place], samples_per_period, each, cancelled)
+            search_seconds = 0.0  # for one candidate: the others are there to be made smaller
             for tried in reversed(tries):
                 one = self._largest(tried)
                 best = one if best is None or one.value < best.value else best
@@ -225,12 +225,12 @@ class Prover:
                     break
         return best
 
-    def aimed(self, candidate: Candidate) -> Task:
+    def harder_task(self, candidate: Candidate) -> Task:
         """Return the task made harder by what the candidate's proof lacks at full size; else the task itself."""
         first = self._at_full_size(self._task, candidate)
         return (self._harder(first) if first.why else None) or self._task
 
-    def safe(self, task: Task) -> Array:
+    def safe_posture(self, task: Task) -> Array:
         """Return a posture that keeps the task's limits and clearance, shape (joints,); raises if none is found."""
         if task.extra_clearance == self._task.extra_clearance:
             return self._safe
@@ -241,13 +241,18 @@ class Prover:
         task = tightened(attempt.task, attempt.proof, self._limits)
         try:
             if task is not None:
-                self.safe(task)
+                self.safe_posture(task)
         except MotionRefused:
             return None
         return task
 
     def _searched_on(
-        self, task: Task, candidate: Candidate, per_period: int, seconds: float | None, cancelled: Callable[[], bool]
+        self,
+        task: Task,
+        candidate: Candidate,
+        samples_per_period: int,
+        seconds: float | None,
+        cancelled: Callable[[], bool],
     ) -> list[Attempt]:
         """Return a candidate and what was found from it, each the answer to the proof of the one before."""
         tried = [self._at_full_size(task, candidate)]
@@ -261,7 +266,7 @@ class Prover:
             def over(until: float | None = until) -> bool:
                 return cancelled() or (until is not None and self._clock() >= until)
 
-            found = polished(harder, whole, self.safe(harder), candidate.start, per_period, over)
+            found = polished(harder, whole, self.safe_posture(harder), candidate.start, samples_per_period, over)
             tried.append(self._at_full_size(harder, found))
         return tried
 
@@ -291,7 +296,7 @@ class Prover:
         return replace(attempt, result=result, value=value, refused=refused)
 
     def _scaled(self, coefficients: Array, share: float) -> Array:
-        middle = self._task.basis.still(coefficients)
+        middle = self._task.basis.standing_at_middle(coefficients)
         return middle + share * (coefficients - middle)
 
 
@@ -324,7 +329,7 @@ class Designed:
     binding: tuple[str, ...] = ()
 
 
-def family(design: Design, model: ArmModel) -> tuple[Basis, BaseParameters]:
+def motion_family(design: Design, model: ArmModel) -> tuple[Basis, BaseParameters]:
     """Return the motion family (Fourier or postures) of a design, and the base parameters that it can identify."""
     if design.motion == "fourier":
         basis = FourierBasis(design.base_frequency, design.harmonics, design.periods, design.ramp)
@@ -340,7 +345,7 @@ def complete_task(
     basis: Basis,
     base: BaseParameters,
     noise: Array | None = None,
-    added: Array | None = None,
+    earlier_information: Array | None = None,
 ) -> Task:
     """Build the search task of a design, with limits less margins; raises where limits or parameters do not fit.
 
@@ -350,7 +355,8 @@ def complete_task(
         basis: family of motions.
         base: the parameters that the motion shall teach.
         noise: standard deviation of each joint's torque, shape (joints,); the description's when None.
-        added: information from earlier recordings, plain rows for the condition number and else whitened by `noise`.
+        earlier_information: information from earlier recordings, plain rows for the condition number and else whitened
+            by `noise`.
 
     Raises:
         MotionRefused: limits are missing or contradict each other.
@@ -379,7 +385,7 @@ def complete_task(
         noise=np.ones_like(own_noise) if plain else own_noise,
         friction=expected_friction(model, full, design.friction_guess),
         rate=model.config.control.rate,
-        added=added,
+        added=earlier_information,
     )
 
 
@@ -430,8 +436,8 @@ def design_motion(
     basis: Basis | None = None,
     base: BaseParameters | None = None,
     noise: Array | None = None,
-    added: Array | None = None,
-    earlier: SearchResult | None = None,
+    earlier_information: Array | None = None,
+    earlier_search: SearchResult | None = None,
     veto: Callable[[FourierPath | PosturePath], str | None] = lambda _: None,
     stable: Callable[[Array, Array], bool] = lambda kp, kd: True,
     tell: Callable[[Progress], None] = lambda _: None,
@@ -447,8 +453,8 @@ def design_motion(
         basis: another family of motions.
         base: the parameters that the motion shall teach; all that the family can when None.
         noise: standard deviation of each joint's torque, shape (joints,); from the description when None.
-        added: information from earlier recordings (`settled`).
-        earlier: earlier search for the same task, to go on from.
+        earlier_information: information from earlier recordings (`settled`).
+        earlier_search: earlier search for the same task, to go on from.
         veto: function that returns a further objection to a motion of which everything is proven, in words, or None; a
             motion with one is made smaller.
         stable: function that judges gains kp and kd, each of shape (joints,), before they are proposed.
@@ -459,10 +465,10 @@ def design_motion(
         MotionRefused: limits are missing or contradict each other, home is in collision, or no posture keeps them.
         UsageError: parameters that are none.
     """
-    asked = family(design, model)
+    asked = motion_family(design, model)
     require_storable(asked[0] if basis is None else basis)
     basis, base = asked[0] if basis is None else basis, asked[1] if base is None else base
-    task = complete_task(model, design, basis, base, noise, added)
+    task = complete_task(model, design, basis, base, noise, earlier_information)
     collision = CollisionModel(model)
     _require_free_home(model, task.limits, collision)
     safe = safe_posture(model, task.limits, seed)
@@ -472,7 +478,7 @@ def design_motion(
     prover = Prover(
         model, task, safe, design.torque_margin, lambda X: criterion_of(task, basis.path(X), base), veto, budget.clock
     )
-    found, best = _searched(task, prover, safe, seed, budget, tell, cancelled, earlier)
+    found, best = _searched(task, prover, safe, seed, budget, tell, cancelled, earlier_search)
     limits = motion_limits(model.config)
     if best.result is None and best.candidate.start >= 0:
         gains = _gains(best, (), limits, stable)
@@ -491,9 +497,9 @@ def design_motion(
         "designed", path, model.config.motion_sha256, _made(model, design, seed, found, kappa, best.value, proof)
     )
     held: tuple[str, ...] = ()
-    if best.value < criterion_of(task, basis.path(basis.still(coefficients)), base):
+    if best.value < criterion_of(task, basis.path(basis.standing_at_middle(coefficients)), base):
         whole = best.candidate.coefficients
-        bound = binding(best.task, whole, per_period(basis))
+        bound = active_limits(best.task, whole, samples_per_period(basis))
         lengths = ["rad" if turns else "m" for turns in model.chain.revolute]
         gains = _gains(best, bound, limits, stable)
         held = (
@@ -514,7 +520,7 @@ def _searched(
     earlier: SearchResult | None,
 ) -> tuple[SearchResult, Attempt]:
     """Search, prove, and spend what time is left on what the proof objects to, or else on searching on."""
-    begun, per = budget.clock(), per_period(task.basis)
+    begun, per = budget.clock(), samples_per_period(task.basis)
 
     def left() -> float:
         return np.inf if budget.seconds is None else budget.seconds - (budget.clock() - begun)
@@ -530,11 +536,13 @@ def _searched(
             look = min(FIRST_LOOK, _LOOKING * budget.seconds)
             looked = search(task, safe, seed, replace(budget, seconds=look), per, tell, cancelled)
             if looked.candidates[0].start >= 0 and not cancelled():
-                aimed = prover.aimed(looked.candidates[0])
+                aimed = prover.harder_task(looked.candidates[0])
             if aimed is not task:
                 before, looked = looked.candidates, None
             seconds -= look
-    found = search(aimed, prover.safe(aimed), seed, replace(budget, seconds=seconds), per, tell, cancelled, looked)
+    found = search(
+        aimed, prover.safe_posture(aimed), seed, replace(budget, seconds=seconds), per, tell, cancelled, looked
+    )
     best = prover.prove_best(found.candidates, per, kept_back, cancelled, task=aimed)
     # What the first look came to may be better, made smaller, than what a short or cancelled search came to after it.
     best = prover.prove_best(before[:1], per, 0.0, cancelled, best)
@@ -557,9 +565,9 @@ def _gains(
     """Propose gains by joint, for a motion as it was found and what its proof came to."""
     task, tracking = attempt.task, attempt.proof.tracking
     late = np.zeros(len(limits.kp), dtype=bool)
-    needed = needed_stiffness(task, attempt.candidate.coefficients, per_period(task.basis))
+    needed = needed_stiffness(task, attempt.candidate.coefficients, samples_per_period(task.basis))
     if tracking is not None:
-        late = tracking.late(limits)
+        late = tracking.lagging_joints(limits)
         needed = np.maximum(needed, np.where(late, tracking.error / (USABLE * limits.following_error), 0.0))
     return stiffer_gains(bound, late, needed, limits, stable)
 
@@ -567,11 +575,11 @@ def _gains(
 def _scaling_text(task: Task, base: BaseParameters, attempt: Attempt) -> str:
     """Say what it costs that a motion was made smaller until it could be proven."""
     lost = attempt.value - criterion_of(task, task.basis.path(attempt.candidate.coefficients), base)
-    gain = gain_words(task.criterion, float(np.exp(max(lost, 0.0))))
+    gain = improvement_words(task.criterion, float(np.exp(max(lost, 0.0))))
     return f"scaled down until all limits could be proven; at full size it would give about {gain}: {attempt.why}"
 
 
-def require_known_inertia(model: ArmModel, task: Task, safe: Array) -> None:
+def require_known_inertia(model: ArmModel, task: Task, safe_posture: Array) -> None:
     """Given a prior, raise MotionRefused where a joint without drive inertia would lag far at its velocity limit.
 
     The law's stiffness is kp times the inertia that it knows, behind a wrist next to none; and the arm itself, which
@@ -580,7 +588,7 @@ def require_known_inertia(model: ArmModel, task: Task, safe: Array) -> None:
     Args:
         model: of the arm.
         task: of the search.
-        safe: a posture that keeps all limits, shape (joints,).
+        safe_posture: a posture that keeps all limits, shape (joints,).
 
     Raises:
         MotionRefused: a joint without drive inertia would lag at its velocity limit by far more than it may.
@@ -589,7 +597,7 @@ def require_known_inertia(model: ArmModel, task: Task, safe: Array) -> None:
     if used.prior is None:
         return
     drives = (model.chain.coupling**2).T @ used.layout.term_values("drive_inertia", used.prior)
-    times = needed_stiffness(task, task.basis.standing(safe), per_period(task.basis))
+    times = needed_stiffness(task, task.basis.standing(safe_posture), samples_per_period(task.basis))
     soft = [k for k, name in enumerate(model.chain.names) if drives[k] <= 0.0 and times[k] > _SOFT]
     if soft:
         names = [model.chain.names[k] for k in soft]
@@ -616,7 +624,7 @@ def require_storable(basis: Basis) -> None:
         )
 
 
-def per_period(basis: Basis) -> int:
+def samples_per_period(basis: Basis) -> int:
     """Return the number of samples at which a search checks a motion, per period (Fourier) or whole motion."""
     if isinstance(basis, FourierBasis):
         return min(_MOST_SAMPLES, max(120, _PER_HARMONIC * basis.harmonics))
@@ -633,7 +641,7 @@ def criterion_of(task: Task, path: FourierPath | PosturePath, base: BaseParamete
 
 def _require_holdable_home(model: ArmModel, limits: MotionLimits) -> None:
     standing = PosturePath(np.array([limits.home, limits.home]), np.ones(1), 0.0)
-    if weak := demands(standing, model).torque_and_power_violations(model.chain.names, limits, model.config.supply):
+    if weak := peak_bounds(standing, model).torque_and_power_violations(model.chain.names, limits, model.config.supply):
         raise MotionRefused(
             f"{model.config.name}: the arm cannot be held at home, where motions begin, within what the margins leave: "
             f"{'; '.join(weak)}"

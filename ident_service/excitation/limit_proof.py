@@ -35,7 +35,7 @@ from ident_service.config.motion_limits import MotionLimits, motor_limits
 from ident_service.errors import ModelError, MotionRefused
 from ident_service.excitation.optimal_design import Task
 from ident_service.excitation.tracking import Tracking, segment_tube_width, track
-from ident_service.excitation.trajectory import STEP_PEAKS, Basis, FourierPath, Path, PosturePath
+from ident_service.excitation.trajectory import STEP_PEAKS, Basis, FourierPath, MotionPath, PosturePath
 from ident_service.model.arm_model import ArmModel, control_model
 from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel
@@ -61,7 +61,7 @@ class TimeIntervals:
     values: list[Array]
     crackle: Array
 
-    def of(self, order: int) -> list[TaylorModel]:
+    def enclosures(self, order: int) -> list[TaylorModel]:
         """Return enclosures over each interval of position (order 0), velocity, acceleration or jerk (3), per joint."""
         h = self.half
         rest = self.crackle * (h ** (5 - order) / factorial(5 - order))[:, None]
@@ -71,16 +71,16 @@ class TimeIntervals:
         return [TaylorModel(middle[:, k], slope[:, k], rest[:, k], h) for k in range(middle.shape[1])]
 
 
-def stretches(path: Path, longest: float | None = None) -> TimeIntervals:
+def time_intervals(path: MotionPath, longest_seconds: float | None = None) -> TimeIntervals:
     """Cover each distinct part of a motion once with short time intervals, with derivatives at their middles.
 
     Args:
         path: the motion.
-        longest: greatest length of the stretches [s]; by default a small part of the fastest oscillation.
+        longest_seconds: greatest length of the stretches [s]; by default a small part of the fastest oscillation.
     """
     edges = []
     for begin, end in path.distinct:
-        length = 1.0 / (_PER_CYCLE * path.fastest(begin, end)) if longest is None else longest
+        length = 1.0 / (_PER_CYCLE * path.highest_frequency(begin, end)) if longest_seconds is None else longest_seconds
         inner = path.seams[(path.seams > begin) & (path.seams < end)]
         corners = np.concatenate([[begin], inner, [end]])
         for first, last in pairwise(corners.tolist()):
@@ -122,11 +122,11 @@ class PeakBounds:
     slack: dict[str, Array]
     motors: Array | None = None
 
-    def violations(self, names: tuple[str, ...], limits: MotionLimits, supply: Supply | None = None) -> list[str]:
+    def violations(self, joint_names: tuple[str, ...], limits: MotionLimits, supply: Supply | None = None) -> list[str]:
         """Return a sentence for each limit that a bound exceeds (NaN does too); bounds that are None are not judged."""
         # Negated comparisons, so that a bound that is NaN counts as beyond every limit.
         found = []
-        for k, name in enumerate(names):
+        for k, name in enumerate(joint_names):
             if not (self.lowest[k] >= limits.lower[k] and self.highest[k] <= limits.upper[k]):
                 found.append(
                     f"{name}: position {self.lowest[k]:.3f}..{self.highest[k]:.3f} "
@@ -136,15 +136,15 @@ class PeakBounds:
                 peak, limit = getattr(self, key), getattr(limits, key)
                 if not peak[k] <= limit[k]:
                     found.append(f"{name}: {key} {peak[k]:.3f} exceeds {limit[k]:g}")
-        return found + self.torque_and_power_violations(names, limits, supply)
+        return found + self.torque_and_power_violations(joint_names, limits, supply)
 
     def torque_and_power_violations(
-        self, names: tuple[str, ...], limits: MotionLimits, supply: Supply | None = None
+        self, joint_names: tuple[str, ...], limits: MotionLimits, supply: Supply | None = None
     ) -> list[str]:
         """Return a sentence for each limit that a known bound of joint torque, motor torque or power exceeds."""
         found = []
         if self.torque is not None:
-            rows = zip(names, self.torque, limits.torque, strict=True)
+            rows = zip(joint_names, self.torque, limits.torque, strict=True)
             found += [f"{name}: torque {peak:.3f} exceeds {limit:g}" for name, peak, limit in rows if not peak <= limit]
         if self.motors is not None and limits.motors is not None:
             rows = zip(limits.motors.names, self.motors, limits.motors.torque, strict=True)
@@ -154,15 +154,15 @@ class PeakBounds:
         return found
 
 
-def demands(path: Path, model: ArmModel) -> PeakBounds:
+def peak_bounds(path: MotionPath, model: ArmModel) -> PeakBounds:
     """Bound a motion's position to jerk over all time and, given a prior, torque and (with a supply) power; else None.
 
     Args:
         path: the motion.
         model: model whose prior parameters give the torque.
     """
-    cells = stretches(path)
-    position = cells.of(0)
+    cells = time_intervals(path)
+    position = cells.enclosures(0)
     bounds: dict[str, Array] = {
         "lowest": np.array([-value.lowest.min() for value in position]),
         "highest": np.array([value.highest.max() for value in position]),
@@ -175,7 +175,9 @@ def demands(path: Path, model: ArmModel) -> PeakBounds:
         "lowest": bounds["lowest"] + cells.values[0].min(axis=0),
         "highest": bounds["highest"] - cells.values[0].max(axis=0),
     }
-    enclosed = {kind: cells.of(order) for order, kind in enumerate(("velocity", "acceleration", "jerk"), start=1)}
+    enclosed = {
+        kind: cells.enclosures(order) for order, kind in enumerate(("velocity", "acceleration", "jerk"), start=1)
+    }
     prior = control_model(model).prior
     if prior is not None:
         enclosed["torque"] = torque_enclosures(cells, model, prior)
@@ -207,7 +209,7 @@ def demands(path: Path, model: ArmModel) -> PeakBounds:
     )
 
 
-def torque_enclosures(cells: TimeIntervals, model: ArmModel, delta: Array) -> list[TaylorModel]:
+def torque_enclosures(intervals: TimeIntervals, model: ArmModel, delta: Array) -> list[TaylorModel]:
     """Return bounds of every joint's torque [N m or N] over each time interval, with link parameters `delta`."""
     tape, entries = traced_regressor(model.chain, model.layout)
     n = model.chain.joints
@@ -215,9 +217,9 @@ def torque_enclosures(cells: TimeIntervals, model: ArmModel, delta: Array) -> li
     for (joint, column), entry in entries.items():
         if (factor := float(delta[column])) != 0.0:
             torque[joint] = torque[joint] + entry * factor
-    velocity = cells.of(1)
+    velocity = intervals.enclosures(1)
     direction = [rate.function("sign") for rate in _drive_rates(velocity, model.chain.coupling)]
-    return enclose(tape, [*cells.of(0), *velocity, *cells.of(2), *direction], torque)
+    return enclose(tape, [*intervals.enclosures(0), *velocity, *intervals.enclosures(2), *direction], torque)
 
 
 def _drive_rates(velocity: list[TaylorModel], coupling: Array) -> list[TaylorModel]:
@@ -245,13 +247,13 @@ def power_bounds(torque: list[TaylorModel], velocity: list[TaylorModel], supply:
     return total
 
 
-def require_within_limits(path: Path, model: ArmModel, limits: MotionLimits) -> PeakBounds:
+def require_within_limits(path: MotionPath, model: ArmModel, limits: MotionLimits) -> PeakBounds:
     """Return the motion's peak bounds; raise MotionRefused naming every limit that they exceed.
 
     Raises:
         MotionRefused: it asks for more than the arm may do; every violation is named.
     """
-    asked = demands(path, model)
+    asked = peak_bounds(path, model)
     if found := asked.violations(model.chain.names, limits, model.config.supply):
         raise MotionRefused("the motion leaves the arm's limits: " + "; ".join(found))
     return asked
@@ -292,13 +294,15 @@ class Clearance:
         return self.lower_bound >= self.required
 
 
-def certified_clearance(collision: CollisionModel, path: Path, clearance: float, tube: Tube | None = None) -> Clearance:
+def certified_clearance(
+    collision: CollisionModel, path: MotionPath, required_clearance: float, tube: Tube | None = None
+) -> Clearance:
     """Return a proven lower bound of the distance of all pairs of bodies along a path, and where it is least.
 
     Args:
         collision: the pairs.
         path: the motion.
-        clearance: distance to be kept [m].
+        required_clearance: distance to be kept [m].
         tube: how far from the path the arm may be; nowhere when None.
 
     Raises:
@@ -318,30 +322,33 @@ def certified_clearance(collision: CollisionModel, path: Path, clearance: float,
     for begin, end in path.distinct:
         corners = [begin, *seams[(seams > begin) & (seams < end)].tolist(), end]
         stretches += list(pairwise(corners))
-    return _certified(collision, motion, stretches, clearance, tube)
+    return _certified(collision, motion, stretches, required_clearance, tube)
 
 
 def certified_along(
     collision: CollisionModel,
     position: Callable[[Array], Array],
-    speed: Array,
+    highest_speed: Array,
     duration: float,
-    clearance: float,
+    required_clearance: float,
 ) -> Clearance:
-    """Return a proven lower bound of the distance of all pairs for any motion no faster than `speed`.
+    """Return a proven lower bound of the distance of all pairs for any motion no faster than `highest_speed`.
 
     Args:
         collision: the pairs.
         position: function from times [s], shape (samples,), to positions [rad or m], shape (samples, joints).
-        speed: no joint is ever faster [rad/s or m/s], shape (joints,).
+        highest_speed: no joint is ever faster [rad/s or m/s], shape (joints,).
         duration: of the motion [s].
-        clearance: distance to be kept [m].
+        required_clearance: distance to be kept [m].
 
     Raises:
         ModelError: positions of another number of joints, or a sliding joint without position limits.
     """
     return _certified(
-        collision, lambda time, half: (position(time), half[:, None] * np.abs(speed)), [(0.0, duration)], clearance
+        collision,
+        lambda time, half: (position(time), half[:, None] * np.abs(highest_speed)),
+        [(0.0, duration)],
+        required_clearance,
     )
 
 
@@ -439,17 +446,17 @@ def proof_of(
     margin = model.config.design.torque_margin if torque_margin is None else torque_margin
     ways = _approach_paths(path, limits)
 
-    def clear(one: Path, tube: Tube | None = None) -> Clearance | None:
+    def clear(one: MotionPath, tube: Tube | None = None) -> Clearance | None:
         return certified_clearance(collision, one, model.config.workspace.clearance, tube) if collision.pairs else None
 
-    proof = Proof(demands(path, model), clear(path), clear(ways), demands(ways, model))
+    proof = Proof(peak_bounds(path, model), clear(path), clear(ways), peak_bounds(ways, model))
     if model.prior is None or violations(proof, model, limits):
         return proof
     tracking = track(path, model, margin)
     proof = replace(proof, tracking=tracking)
     if not collision.pairs or violations(proof, model, limits):
         return proof
-    proof = replace(proof, clearance=clear(path, tracking.width))
+    proof = replace(proof, clearance=clear(path, tracking.tube_width))
     if violations(proof, model, limits):
         return proof
     return replace(proof, approach=clear(ways, segment_tube_width(ways, model, margin)))
@@ -500,7 +507,7 @@ def tightened(task: Task, proof: Proof, limits: MotionLimits) -> Task | None:
     """
     allowed, velocity, extra = task.limits.following_error, task.limits.velocity, task.extra_clearance
     if proof.tracking is not None:
-        behind, fast = proof.tracking.used(limits)
+        behind, fast = proof.tracking.limit_shares(limits)
         allowed = allowed / np.where(behind > 1.0, _FREER * behind, 1.0)
         velocity = velocity / np.where(fast > 1.0, fast, 1.0)
     if proof.clearance is not None and not proof.clearance.proven:
@@ -517,8 +524,8 @@ def tightened(task: Task, proof: Proof, limits: MotionLimits) -> Task | None:
 def scale_to_verified(
     basis: Basis,
     coefficients: Array,
-    safe: Array,
-    proven: Callable[[Array], Proof | None],
+    standing_coefficients: Array,
+    prove: Callable[[Array], Proof | None],
 ) -> tuple[Array, Proof] | None:
     """Return a motion's coefficients and proof if proven, else of a smaller one; None if even 1 % of it is not.
 
@@ -528,13 +535,13 @@ def scale_to_verified(
     Args:
         basis: the family.
         coefficients: of the motion, shape (joints, size).
-        safe: coefficients of standing still in a posture that keeps all limits.
-        proven: the proof of a motion that keeps all limits, None for one that does not.
+        standing_coefficients: coefficients of standing still in a posture that keeps all limits.
+        prove: the proof of a motion that keeps all limits, None for one that does not.
     """
-    if (proof := proven(coefficients)) is not None:
+    if (proof := prove(coefficients)) is not None:
         return coefficients, proof
     best: tuple[float, tuple[Array, Proof]] | None = None
-    for anchor in (basis.still(coefficients), safe):
+    for anchor in (basis.standing_at_middle(coefficients), standing_coefficients):
         if best is not None and best[0] >= _LARGE:
             break  # where a motion's own middle is a bad place, little is left of it; the safe posture may leave more
         found: tuple[Array, Proof] | None = None
@@ -544,7 +551,7 @@ def scale_to_verified(
             size = too_large + step if found is None else (too_large + small_enough) // 2
             size = min(size, len(_SHRINKS) - 1)
             smaller = anchor + _SHRINKS[size] * (coefficients - anchor)
-            if (proof := proven(smaller)) is not None:
+            if (proof := prove(smaller)) is not None:
                 found, small_enough = (smaller, proof), size
             else:
                 too_large, step = size, 2 * step

@@ -35,7 +35,7 @@ from ident_service.excitation.prediction import (
     rate_of_change,
     uncompensated_friction,
 )
-from ident_service.excitation.trajectory import Basis, maps
+from ident_service.excitation.trajectory import Basis, basis_values
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import base_parameters
 from ident_service.model.capsule_distances import CapsuleModel
@@ -78,7 +78,7 @@ class Task:
     extra_clearance: float = 0.0
 
 
-def usable_limits(names: tuple[str, ...], limits: MotionLimits, design: Design) -> MotionLimits:
+def usable_limits(joint_names: tuple[str, ...], limits: MotionLimits, design: Design) -> MotionLimits:
     """Return the limits less the design's margins of position and torque; raises if no range is left.
 
     Raises:
@@ -88,7 +88,7 @@ def usable_limits(names: tuple[str, ...], limits: MotionLimits, design: Design) 
     lower, upper = limits.lower + margin, limits.upper - margin
     if gone := [
         f"{name}: {low:g}..{high:g} less {m:g} on either side"
-        for name, low, high, m, left in zip(names, limits.lower, limits.upper, margin, upper - lower, strict=True)
+        for name, low, high, m, left in zip(joint_names, limits.lower, limits.upper, margin, upper - lower, strict=True)
         if left <= 0.0
     ]:
         raise MotionRefused("the position margin leaves nothing of the range of " + "; ".join(gone))
@@ -118,8 +118,8 @@ def criterion(
     kind: Criterion,
     G: Array,
     sharpness: float = 16.0,
-    chosen: NDArray[np.intp] | None = None,
-    scale: Array | None = None,
+    chosen_indices: NDArray[np.intp] | None = None,
+    parameter_scales: Array | None = None,
 ) -> Value:
     """Return a criterion's value (smaller is better) and its gradient over the information matrix G.
 
@@ -127,8 +127,8 @@ def criterion(
         kind: kind of criterion.
         G: information matrix, shape (base, base).
         sharpness: exponent of the condition number's power means.
-        chosen: indices of the parameters, for `a_optimal`; all when None.
-        scale: unit of each parameter's deviation, for `a_optimal`, shape (base,).
+        chosen_indices: indices of the parameters, for `a_optimal`; all when None.
+        parameter_scales: unit of each parameter's deviation, for `a_optimal`, shape (base,).
     """
     eigenvalues, V = np.linalg.eigh(G)
     eigenvalues = np.maximum(eigenvalues, _FLOOR * max(float(eigenvalues[-1]), _NOTHING))
@@ -136,9 +136,9 @@ def criterion(
     if kind == "d_optimal":
         return Value(-float(np.log(eigenvalues).sum()) / n, -(V / (n * eigenvalues)) @ V.T)
     if kind == "a_optimal":
-        pick = np.arange(n) if chosen is None else chosen
+        pick = np.arange(n) if chosen_indices is None else chosen_indices
         weights = np.zeros(n)
-        weights[pick] = 1.0 if scale is None else 1.0 / scale[pick] ** 2
+        weights[pick] = 1.0 if parameter_scales is None else 1.0 / parameter_scales[pick] ** 2
         weights /= len(pick)
         inverse = (V / eigenvalues) @ V.T
         mean = float(weights @ np.diag(inverse))
@@ -176,10 +176,10 @@ class Multipliers:
     values: Limits
     weight: float
 
-    def tightened(self, found: Limits, factor: float) -> Multipliers:
-        """Return the updated multipliers, and the weight times `factor`, after a minimisation that ended at `found`."""
-        values = {name: np.maximum(0.0, self.values[name] + self.weight * c) for name, c in found.items()}
-        return Multipliers(values, self.weight * factor)
+    def tightened(self, limit_values: Limits, weight_factor: float) -> Multipliers:
+        """Return multipliers and weight (times `weight_factor`) after a minimisation that ended at `limit_values`."""
+        values = {name: np.maximum(0.0, self.values[name] + self.weight * c) for name, c in limit_values.items()}
+        return Multipliers(values, self.weight * weight_factor)
 
 
 @dataclass(frozen=True)
@@ -205,19 +205,19 @@ class State:
 class Problem:
     """Optimisation problem of one search on one time grid."""
 
-    def __init__(self, task: Task, per_period: int) -> None:
+    def __init__(self, task: Task, samples_per_period: int) -> None:
         """Prepare the time grid.
 
         Args:
             task: task of the search.
-            per_period: samples per period.
+            samples_per_period: samples per period.
         """
         self.task = task
         model, limits = task.model, task.limits
         self._n = model.chain.joints
         self._regressor = RegressorGradient(model.chain, model.layout, task.columns)
-        times, weights = task.basis.samples(per_period)
-        self._maps = maps(task.basis, times)
+        times, weights = task.basis.samples(samples_per_period)
+        self._maps = basis_values(task.basis, times)
         self._weights = weights * task.rate
         self._middle, self._half = 0.5 * (limits.lower + limits.upper), 0.5 * (limits.upper - limits.lower)
         sizes = [np.maximum(np.abs(values).max(axis=0), 1e-12) for values in self._maps[:2]]
@@ -240,7 +240,7 @@ class Problem:
         self._clearance[: len(times)] += task.extra_clearance
         # The straight way from home to where the motion begins, for which only clearance matters.
         self._line = np.linspace(0.0, 1.0, _LINE)[:, None]
-        self._begin = maps(task.basis, np.zeros(1))[0]
+        self._begin = basis_values(task.basis, np.zeros(1))[0]
         self.names = list(LINEAR)
         self.names += ["torque"] * (model.prior is not None) + ["motor torque"] * (self._motors is not None)
         self.names += ["power"] * (self._supply is not None)
@@ -284,11 +284,13 @@ class Problem:
         """Return the search variables of a motion's coefficients, the inverse of `coefficients`."""
         return np.asarray(((coefficients - self._offset) / self._scale).ravel())
 
-    def no_multipliers(self, weight: float) -> Multipliers:
+    def no_multipliers(self, penalty_weight: float) -> Multipliers:
         """Return multipliers that are all zero, with this penalty weight."""
         samples = len(self._weights)
         shapes = {"power": (samples, 1), "clearance": (samples + _LINE, len(self._capsules.pairs))}
-        return Multipliers({name: np.zeros(shapes.get(name, (samples, self._n))) for name in self.names}, weight)
+        return Multipliers(
+            {name: np.zeros(shapes.get(name, (samples, self._n))) for name in self.names}, penalty_weight
+        )
 
     def linear_peaks(self, x: Array, share: float) -> set[Peak]:
         """Return local peaks above a share of limits linear in x, with neighbours: (kind, sample, joint, upper side).

@@ -127,20 +127,24 @@ def described_noise(model: ArmModel, limits: MotionLimits) -> NoiseModel:
     return NoiseModel(fallback, 1.0, f"{_NOISE_SHARE:.0%} of the torque limits, assumed")
 
 
-def information(path: FourierPath | PosturePath, model: ArmModel, base: BaseParameters, noise: Array) -> Array:
+def information(
+    path: FourierPath | PosturePath, model: ArmModel, base: BaseParameters, torque_deviations: Array
+) -> Array:
     """Return the information matrix per sample of a motion without its ramps, shape (base, base).
 
     Args:
         path: the motion.
         model: of the arm.
         base: the parameters.
-        noise: standard deviation of each joint's torque, shape (joints,).
+        torque_deviations: standard deviation of each joint's torque, shape (joints,).
     """
     begin, end = path.distinct[1] if len(path.distinct) > 1 else path.distinct[0]
     time = begin + (np.arange(_SAMPLES) + 0.5) * (end - begin) / _SAMPLES
     q, dq, ddq, _ = path.at(time)
     H = joint_regressor(model.chain, model.layout, q, dq, ddq, base.base)
-    return np.asarray(sum(rows @ rows.T / sigma**2 for rows, sigma in zip(H, noise, strict=True)) / _SAMPLES)
+    return np.asarray(
+        sum(rows @ rows.T / sigma**2 for rows, sigma in zip(H, torque_deviations, strict=True)) / _SAMPLES
+    )
 
 
 def seconds_of_information(path: FourierPath | PosturePath) -> float:
@@ -153,7 +157,7 @@ def expected_deviations(
     model: ArmModel,
     base: BaseParameters,
     noise: NoiseModel,
-    added: Array | None = None,
+    earlier_information: Array | None = None,
 ) -> Array:
     """Return the expected standard deviations of the base parameters [SI], shape (base,); infinite where unseen.
 
@@ -162,11 +166,11 @@ def expected_deviations(
         model: of the arm; its control rate is that of the recording.
         base: the parameters.
         noise: of the torques.
-        added: information from earlier recordings, whitened by `noise.deviation`, shape (base, base).
+        earlier_information: information from earlier recordings, whitened by `noise.deviation`, shape (base, base).
     """
     G = information(path, model, base, noise.deviation) * seconds_of_information(path) * model.config.control.rate
-    if added is not None:
-        G = G + added
+    if earlier_information is not None:
+        G = G + earlier_information
     # Parameters have units of their own; scaled to a unit diagonal, what is not taught shows as an eigenvalue of zero.
     size = np.sqrt(np.diag(G))
     seen = size > 0.0
@@ -196,9 +200,9 @@ def dry_friction(model: ArmModel, delta: Array) -> tuple[Array, Array]:
     return drives, drives @ np.abs(model.chain.coupling)
 
 
-def uncompensated_friction(friction: ExpectedFriction, share: float) -> ExpectedFriction:
-    """Return the most friction a feed-forward of `share` leaves if the true one is 0.6 to 1.4 times this; offset 0."""
-    left = max(DOUBT[1] - share, share - DOUBT[0])
+def uncompensated_friction(friction: ExpectedFriction, compensated_share: float) -> ExpectedFriction:
+    """Return the most friction that a feed-forward leaves if the true one is 0.6 to 1.4 times this; offset 0."""
+    left = max(DOUBT[1] - compensated_share, compensated_share - DOUBT[0])
     return ExpectedFriction(left * friction.coulomb, left * friction.viscous, 0.0 * friction.offset)
 
 

@@ -72,34 +72,40 @@ class Candidate:
     coefficients: Array
 
 
-def random_variables(problem: Problem, rng: np.random.Generator, safe: Array) -> Array:
+def random_variables(problem: Problem, rng: np.random.Generator, standing_coefficients: Array) -> Array:
     """Return search variables of a random motion about a posture between the safe one and a random one.
 
     Args:
         problem: of the search.
         rng: of this start.
-        safe: coefficients of standing still in a posture that keeps all limits.
+        standing_coefficients: coefficients of standing still in a posture that keeps all limits.
     """
     basis = problem.task.basis
     limits = problem.task.limits
     share = rng.uniform(0.0, 1.0) ** 2
     posture = rng.uniform(limits.lower, limits.upper)
-    middle = (1.0 - share) * safe + share * basis.standing(posture)
+    middle = (1.0 - share) * standing_coefficients + share * basis.standing(posture)
     x = problem.variables(middle)
     noise = rng.normal(scale=_SPREAD, size=(len(posture), basis.size))
     return x + np.where(basis.moving, noise, 0.0).ravel()
 
 
 def local_search(
-    problem: Problem, x: Array, safe: Array, start: int, check: Callable[[], None], *, polish: bool = False
+    problem: Problem,
+    x: Array,
+    standing_coefficients: Array,
+    start_number: int,
+    check: Callable[[], None],
+    *,
+    polish: bool = False,
 ) -> Candidate:
     """Improve a motion by local search; return the best candidate that keeps all limits at the samples.
 
     Args:
         problem: of the search.
         x: variables to begin with, shape (problem.size,).
-        safe: coefficients of standing still in a posture that keeps all limits.
-        start: number of the random start.
+        standing_coefficients: coefficients of standing still in a posture that keeps all limits.
+        start_number: number of the random start.
         check: called at every evaluation; what it raises ends the rounds.
         polish: True for a motion that is good already.
 
@@ -107,7 +113,7 @@ def local_search(
         InterruptedWithResult: `check` raised Interrupted; with the best of what the rounds had found until then.
     """
     if polish:
-        return _polished(problem, x, safe, start, check)
+        return _polished(problem, x, standing_coefficients, start_number, check)
     state = problem.no_multipliers(1.0)
     reached, latest = [x], [x]
 
@@ -135,9 +141,9 @@ def local_search(
     except Interrupted:
         # An interrupted round may be far outside the limits; earlier points may be better.
         raise InterruptedWithResult(
-            _best_of([best_feasible(problem, one, safe, start) for one in (*reached, *latest)])
+            _best_of([best_feasible(problem, one, standing_coefficients, start_number) for one in (*reached, *latest)])
         ) from None
-    return best_feasible(problem, x, safe, start)
+    return best_feasible(problem, x, standing_coefficients, start_number)
 
 
 def _polished(problem: Problem, x: Array, safe: Array, start: int, check: Callable[[], None]) -> Candidate:
@@ -206,15 +212,15 @@ class InterruptedWithResult(Interrupted):
         super().__init__()
 
 
-def best_feasible(problem: Problem, x: Array, safe: Array, start: int) -> Candidate:
+def best_feasible(problem: Problem, x: Array, standing_coefficients: Array, start_number: int) -> Candidate:
     """Return the best of the motions between x and standing still that keep all limits at the samples.
 
     Standing still means in the motion's own middle, where that keeps the limits, or in the safe posture.
     """
     X = problem.coefficients(x)
-    middle = problem.task.basis.still(X)
-    anchors = [middle, safe] if within_limits(problem, middle) else [safe]
-    return _best_of([_largest(problem, X, anchor, start) for anchor in anchors])
+    middle = problem.task.basis.standing_at_middle(X)
+    anchors = [middle, standing_coefficients] if within_limits(problem, middle) else [standing_coefficients]
+    return _best_of([_largest(problem, X, anchor, start_number) for anchor in anchors])
 
 
 def _largest(problem: Problem, X: Array, anchor: Array, start: int) -> Candidate:
@@ -313,25 +319,25 @@ class SearchResult:
 
 def search(
     task: Task,
-    safe: Array,
+    safe_posture: Array,
     seed: int,
     budget: Budget,
-    per_period: int,
+    samples_per_period: int,
     tell: Callable[[Progress], None] = lambda _: None,
     cancelled: Callable[[], bool] = lambda: False,
-    earlier: SearchResult | None = None,
+    earlier_search: SearchResult | None = None,
 ) -> SearchResult:
     """Search from random starts until the budget is used or `cancelled`; return the best candidates, at least one.
 
     Args:
         task: task of the search.
-        safe: a posture that keeps all limits, shape (joints,).
+        safe_posture: a posture that keeps all limits, shape (joints,).
         seed: of the random starts.
         budget: budget of time and starts.
-        per_period: samples per period of the starts.
+        samples_per_period: samples per period of the starts.
         tell: called from time to time.
         cancelled: called from time to time; True ends the search with what it has.
-        earlier: earlier search for the same task with the same seed, to go on from.
+        earlier_search: earlier search for the same task with the same seed, to go on from.
 
     Returns:
         At least one candidate: standing still in the safe posture, if nothing else.
@@ -340,8 +346,8 @@ def search(
         SolverError: a worker process died before anything was found.
     """
     begun = budget.clock()
-    run = _Run(task, safe, seed, budget, begun, tell, cancelled, earlier)
-    with _worker_pool(task, safe, seed, budget, per_period, cancelled) as workers:
+    run = _Run(task, safe_posture, seed, budget, begun, tell, cancelled, earlier_search)
+    with _worker_pool(task, safe_posture, seed, budget, samples_per_period, cancelled) as workers:
         for end in run.round_ends():
             run.starts(workers, end)
             run.polish(workers, end)
@@ -352,16 +358,21 @@ def search(
 
 
 def polished(
-    task: Task, coefficients: Array, safe: Array, start: int, per_period: int, stopped: Callable[[], bool]
+    task: Task,
+    coefficients: Array,
+    safe_posture: Array,
+    start_number: int,
+    samples_per_period: int,
+    stopped: Callable[[], bool],
 ) -> Candidate:
     """Improve a motion for another task by local search; return the best that keeps its limits at the samples.
 
     Args:
         task: new task.
         coefficients: coefficients of the motion, shape (joints, size).
-        safe: a posture that keeps all limits, shape (joints,).
-        start: number of the random start that it came from.
-        per_period: samples per period of the starts.
+        safe_posture: a posture that keeps all limits, shape (joints,).
+        start_number: number of the random start that it came from.
+        samples_per_period: samples per period of the starts.
         stopped: called at every evaluation; True ends the polish with what it has.
     """
 
@@ -369,11 +380,11 @@ def polished(
         if stopped():
             raise Interrupted
 
-    problem = Problem(task, _FINER * per_period)
+    problem = Problem(task, _FINER * samples_per_period)
     with one_blas_thread():
         try:
             x = problem.variables(coefficients)
-            return local_search(problem, x, task.basis.standing(safe), start, check, polish=True)
+            return local_search(problem, x, task.basis.standing(safe_posture), start_number, check, polish=True)
         except InterruptedWithResult as ended:
             return ended.candidate
 
@@ -501,10 +512,10 @@ class _Run:
 
 @contextmanager
 def _worker_pool(
-    task: Task, safe: Array, seed: int, budget: Budget, per_period: int, cancelled: Callable[[], bool]
+    task: Task, safe: Array, seed: int, budget: Budget, samples_per_period: int, cancelled: Callable[[], bool]
 ) -> Iterator[_WorkerPool]:
     if budget.workers == 1:
-        worker = _Worker(task, safe, seed, per_period, cancelled, budget.clock)
+        worker = _Worker(task, safe, seed, samples_per_period, cancelled, budget.clock)
 
         def here(number: int, candidate: Candidate | None, until: float | None) -> Future[Candidate]:
             future: Future[Candidate] = Future()
@@ -519,7 +530,7 @@ def _worker_pool(
         budget.workers,
         mp_context=context,
         initializer=_begin,
-        initargs=(task, safe, seed, per_period, stop, os.getpid()),
+        initargs=(task, safe, seed, samples_per_period, stop, os.getpid()),
     )
 
     def submit(number: int, candidate: Candidate | None, until: float | None) -> Future[Candidate]:
@@ -545,11 +556,11 @@ class _Worker:
         task: Task,
         safe: Array,
         seed: int,
-        per_period: int,
+        samples_per_period: int,
         stopped: Callable[[], bool],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._coarse, self._fine = Problem(task, per_period), Problem(task, _FINER * per_period)
+        self._coarse, self._fine = Problem(task, samples_per_period), Problem(task, _FINER * samples_per_period)
         self._safe = task.basis.standing(safe)
         self._seed, self._stopped, self._clock = seed, stopped, clock
 
@@ -576,13 +587,13 @@ _TERMINALS: Final = (signal.SIGINT, signal.SIGHUP)  # signals that a terminal se
 _worker: _Worker | None = None
 
 
-def _begin(task: Task, safe: Array, seed: int, per_period: int, stop: Event, parent: int) -> None:
+def _begin(task: Task, safe: Array, seed: int, samples_per_period: int, stop: Event, parent: int) -> None:
     """Initialise a worker process: it ends with its parent, and what a terminal asks is for that, which sets `stop`."""
     global _worker
     for number in _TERMINALS:
         signal.signal(number, signal.SIG_IGN)
     end_with_parent(parent)
-    _worker = _Worker(task, safe, seed, per_period, stop.is_set)
+    _worker = _Worker(task, safe, seed, samples_per_period, stop.is_set)
 
 
 def _work(number: int, candidate: Candidate | None, until: float | None) -> Candidate:
@@ -614,19 +625,19 @@ def fingerprint(task: Task, seed: int) -> str:
     return digest.hexdigest()
 
 
-def found_to_json(found: SearchResult, task: Task) -> str:
-    """Return a search's candidates and state as one JSON text, for `read_found`."""
+def search_to_json(result: SearchResult, task: Task) -> str:
+    """Return a search's candidates and state as one JSON text, for `read_search`."""
     return json.dumps(
         {
             "format": FORMAT,
             "version": VERSION,
-            "task_sha256": fingerprint(task, found.seed),
-            "seed": found.seed,
-            "finished": found.finished,
-            "seconds": found.seconds,
+            "task_sha256": fingerprint(task, result.seed),
+            "seed": result.seed,
+            "finished": result.finished,
+            "seconds": result.seconds,
             "candidates": [
                 {"start": one.start, "value": one.value, "coefficients": one.coefficients.tolist()}
-                for one in found.candidates
+                for one in result.candidates
                 if np.isfinite(one.value)
             ],
         },
@@ -635,11 +646,11 @@ def found_to_json(found: SearchResult, task: Task) -> str:
     )
 
 
-def read_found(file: Path, task: Task, seed: int) -> SearchResult:
+def read_search(file: Path, task: Task, seed: int) -> SearchResult:
     """Read a search to resume from its JSON file; raises UsageError unless task and seed are the same.
 
     Args:
-        file: file that `found_to_json` made.
+        file: file that `search_to_json` made.
         task: task of the resumed search, which must be that of the file.
         seed: seed of the resumed search, which must be that of the file.
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ident_service.config.motion_limits import MotionLimits, motion_limits
 from ident_service.errors import ModelError
 from ident_service.excitation.prediction import DOUBT
-from ident_service.excitation.trajectory import FourierPath, Path
+from ident_service.excitation.trajectory import FourierPath, MotionPath
 from ident_service.model.arm_model import ArmModel, control_model
 from ident_service.model.chain import Array
 from ident_service.model.expected_friction import expected_friction, friction_feedforward
@@ -74,23 +74,23 @@ class Tracking:
     repeated: float = 0.0
     repeats_from: float = np.inf
 
-    def late(self, limits: MotionLimits) -> NDArray[np.bool_]:
+    def lagging_joints(self, limits: MotionLimits) -> NDArray[np.bool_]:
         """Return a mask of joints whose simulated following error exceeds 85 % of its limit, shape (joints,)."""
-        return np.asarray(~(self.used(limits)[0] <= 1.0))
+        return np.asarray(~(self.limit_shares(limits)[0] <= 1.0))
 
-    def used(self, limits: MotionLimits) -> tuple[Array, Array]:
+    def limit_shares(self, limits: MotionLimits) -> tuple[Array, Array]:
         """Return following error over 85 % of its limit, and velocity over 110 % of its limit, shape (joints,) each."""
         return self.error / (_ERROR_USED * limits.following_error), self.velocity / (_VELOCITY_USED * limits.velocity)
 
-    def objections(self, names: Sequence[str], limits: MotionLimits) -> list[str]:
+    def objections(self, joint_names: Sequence[str], limits: MotionLimits) -> list[str]:
         """Return a sentence per joint that lags, speeds or leaves its limits too far in simulation; empty if none.
 
         Args:
-            names: of the joints.
+            joint_names: of the joints.
             limits: of the arm.
         """
-        found, late = [], self.late(limits)
-        for k, name in enumerate(names):
+        found, late = [], self.lagging_joints(limits)
+        for k, name in enumerate(joint_names):
             if late[k]:
                 found.append(
                     f"{name}: lags by {self.error[k]:.3f}, with {self.worst}; of its following_error of "
@@ -105,17 +105,17 @@ class Tracking:
                 found.append(f"{name}: the arm leaves its position limits by {self.beyond[k]:.3f}, with {self.worst}")
         return found
 
-    def width(self, time: Array, half: Array) -> Array:
+    def tube_width(self, time: Array, half_widths: Array) -> Array:
         """Return the simulated arm's largest distance from its reference, widened [rad or m], shape (cells, joints).
 
         Args:
             time: middles of cells of time in the motion [s], shape (cells,).
-            half: half widths of the cells [s], shape (cells,).
+            half_widths: half widths of the cells [s], shape (cells,).
         """
         time = np.where(time > self.repeats_from, time - self.repeated, time)
         last = len(self.tube) - 1
-        first = np.clip(((time - half) / _BIN).astype(int), 0, last)
-        until = np.clip(((time + half) / _BIN).astype(int), 0, last)
+        first = np.clip(((time - half_widths) / _BIN).astype(int), 0, last)
+        until = np.clip(((time + half_widths) / _BIN).astype(int), 0, last)
         width = np.maximum(self.tube[first], self.tube[until])
         for step in range(1, int((until - first).max(initial=0))):
             width = np.maximum(width, self.tube[np.minimum(first + step, until)])
@@ -132,8 +132,8 @@ def cases(torque_margin: float) -> tuple[Case, ...]:
     )
 
 
-def track(path: Path, model: ArmModel, torque_margin: float) -> Tracking:
-    """Simulate the arm over a motion with less friction, and with more and heavier links; return errors and speeds.
+def track(path: MotionPath, model: ArmModel, torque_margin: float) -> Tracking:
+    """Simulate the arm on a motion with friction times 0.6, and 1.4 with heavier links; return errors and speeds.
 
     Of a periodic motion both ramps and one period are simulated, which the others repeat.
 
@@ -173,7 +173,7 @@ def track(path: Path, model: ArmModel, torque_margin: float) -> Tracking:
     return Tracking(error, velocity, beyond, worst, tube, repeated, from_)
 
 
-def segment_tube_width(path: Path, model: ArmModel, torque_margin: float) -> Callable[[Array, Array], Array]:
+def segment_tube_width(path: MotionPath, model: ArmModel, torque_margin: float) -> Callable[[Array, Array], Array]:
     """Simulate the arm over slow segments; return the function of its largest distance from the reference.
 
     Long segments are simulated in parts, whose largest error then counts throughout.
@@ -187,7 +187,7 @@ def segment_tube_width(path: Path, model: ArmModel, torque_margin: float) -> Cal
         torque_margin: as for `track`.
 
     Returns:
-        A function of times and half widths [s], as `Tracking.width`.
+        A function of times and half widths [s], as `Tracking.tube_width`.
 
     Raises:
         ModelError, MotionRefused: as `track`.
@@ -196,7 +196,7 @@ def segment_tube_width(path: Path, model: ArmModel, torque_margin: float) -> Cal
     period = 1.0 / model.config.control.rate
     part = _SETTLES / float(np.sqrt(limits.kp.min()))
     if path.duration <= max(_WHOLE, _PARTS * part):
-        return track(path, model, torque_margin).width
+        return track(path, model, torque_margin).tube_width
     times = period * np.arange(int(np.ceil(part / period)) + 1)
     used = control_model(model)
     if used.prior is None:

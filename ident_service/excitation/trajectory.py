@@ -74,19 +74,19 @@ class FourierSeries(_Sampled):
         """Return the length of one period [s]."""
         return 1.0 / self.base_frequency
 
-    def derivatives(self, time: Array, highest: int) -> list[Array]:
-        """Return position and its time derivatives up to the order `highest`, each of shape (samples, joints)."""
+    def derivatives(self, time: Array, highest_order: int) -> list[Array]:
+        """Return position and its time derivatives up to the order `highest_order`, each of shape (samples, joints)."""
         rates = self._rates
         phase = time[..., None] * rates
         sine, cosine = np.sin(phase), np.cos(phase)
         a, b = self.a.T, self.b.T
         position = (sine / rates) @ a - (cosine / rates) @ b + self.q0
         values = [position, cosine @ a + sine @ b]
-        while len(values) <= highest:
+        while len(values) <= highest_order:
             # Every derivative turns (sine, cosine) by a quarter and multiplies by the rate.
             sine, cosine = cosine * rates, -sine * rates
             values.append(cosine @ a + sine @ b)
-        return values[: highest + 1]
+        return values[: highest_order + 1]
 
     @cached_property
     def _rates(self) -> Array:
@@ -105,7 +105,7 @@ _STEP_DERIVATIVES = (_STEP, *(_STEP.deriv(order) for order in (1, 2, 3, 4)))
 STEP_PEAKS = (1.0, 35.0 / 16.0, 84.0 / 5.0**0.5 / 5.0, 52.5, 840.0, 10080.0)
 
 
-class Path(Protocol):
+class MotionPath(Protocol):
     """Motion of all joints as a function of time."""
 
     @property
@@ -128,11 +128,11 @@ class Path(Protocol):
     def seams(self) -> Array:
         """Return the times at which higher derivatives may jump [s], from 0 to the duration, increasing."""
 
-    def fastest(self, begin: float, end: float) -> float:
+    def highest_frequency(self, begin: float, end: float) -> float:
         """Return the highest frequency of the motion between two times [Hz], for choosing how finely to sample."""
 
-    def derivatives(self, time: Array, highest: int) -> list[Array]:
-        """Return position and its time derivatives up to the order `highest` <= 4, each of shape (samples, joints)."""
+    def derivatives(self, time: Array, highest_order: int) -> list[Array]:
+        """Return position and its time derivatives up to `highest_order` <= 4, each of shape (samples, joints)."""
 
     def at(self, time: Array | float) -> tuple[Array, Array, Array, Array]:
         """Return position, velocity, acceleration and jerk at `time` [s], shape (samples, joints) or (joints,)."""
@@ -195,22 +195,22 @@ class FourierPath(_Sampled):
         ends = [0.0, self.ramp, self.duration - self.ramp, self.duration]
         return np.array(sorted(set(ends)))
 
-    def fastest(self, begin: float, end: float) -> float:
+    def highest_frequency(self, begin: float, end: float) -> float:
         """Return the highest harmonic's frequency [Hz]; in a ramp, the reciprocal ramp time where that is higher."""
         highest = self.series.base_frequency * self.series.a.shape[1]
         in_ramp = self.ramp > 0.0 and (begin < self.ramp or end > self.duration - self.ramp)
         return float(max(highest, 1.0 / self.ramp) if in_ramp else highest)
 
-    def derivatives(self, time: Array, highest: int) -> list[Array]:
-        """Return position and its time derivatives up to the order `highest`, each of shape (samples, joints)."""
-        swing = self.series.derivatives(time - self.ramp, highest)
+    def derivatives(self, time: Array, highest_order: int) -> list[Array]:
+        """Return position and its time derivatives up to the order `highest_order`, each of shape (samples, joints)."""
+        swing = self.series.derivatives(time - self.ramp, highest_order)
         if self.ramp == 0.0:
             return swing
         swing[0] = swing[0] - self.series.q0
-        window = self._window(time, highest)
+        window = self._window(time, highest_order)
         values = [
             np.asarray(sum(comb(order, k) * window[k][..., None] * swing[order - k] for k in range(order + 1)))
-            for order in range(highest + 1)
+            for order in range(highest_order + 1)
         ]
         values[0] = values[0] + self.series.q0
         return values
@@ -281,12 +281,12 @@ class PosturePath(_Sampled):
         """Return the times at which segments begin and end [s]."""
         return np.unique(np.concatenate([[0.0], self._begins[:-1], self._begins[:-1] + self.times, [self.duration]]))
 
-    def fastest(self, begin: float, end: float) -> float:
+    def highest_frequency(self, begin: float, end: float) -> float:
         """Return the reciprocal duration of the shortest of all segments [Hz], whatever the two times are."""
         return float(1.0 / self.times.min())
 
-    def derivatives(self, time: Array, highest: int) -> list[Array]:
-        """Return position and its time derivatives up to the order `highest`, each of shape (samples, joints)."""
+    def derivatives(self, time: Array, highest_order: int) -> list[Array]:
+        """Return position and its time derivatives up to the order `highest_order`, each of shape (samples, joints)."""
         way = np.clip(np.searchsorted(self._begins, time, side="right") - 1, 0, len(self.times) - 1)
         length = self.times[way]
         share = (time - self._begins[way]) / length
@@ -297,7 +297,7 @@ class PosturePath(_Sampled):
             np.asarray(
                 (_STEP_DERIVATIVES[order](share) / length**order * (inside if order else 1.0))[..., None] * whole
             )
-            for order in range(highest + 1)
+            for order in range(highest_order + 1)
         ]
         values[0] = values[0] + self.points[way]
         return values
@@ -320,10 +320,10 @@ class Basis(Protocol):
     def standing(self, posture: Array) -> Array:
         """Return the coefficients of standing still at a posture of shape (joints,), shape (joints, size)."""
 
-    def still(self, coefficients: Array) -> Array:
+    def standing_at_middle(self, coefficients: Array) -> Array:
         """Return the coefficients of standing still at the middle of a motion, shape (joints, size)."""
 
-    def samples(self, per_period: int) -> tuple[Array, Array]:
+    def samples(self, samples_per_period: int) -> tuple[Array, Array]:
         """Return times [s] at which to check limits, and the time that each counts for in the information [s]."""
 
 
@@ -356,16 +356,16 @@ class FourierBasis:
         """Return the coefficients of standing still at a posture of shape (joints,), shape (joints, size)."""
         return np.column_stack([np.zeros((len(posture), 2 * self.harmonics)), posture])
 
-    def still(self, coefficients: Array) -> Array:
+    def standing_at_middle(self, coefficients: Array) -> Array:
         """Return the coefficients of standing still at a motion's middle position, shape (joints, size)."""
         return self.standing(coefficients[:, -1])
 
-    def samples(self, per_period: int) -> tuple[Array, Array]:
+    def samples(self, samples_per_period: int) -> tuple[Array, Array]:
         """Return times [s] in one period and both ramps, and weights [s]: all periods' in the period, 0 in ramps."""
         period = 1.0 / self.base_frequency
-        step = period / per_period
-        times = np.asarray(self.ramp + step * np.arange(per_period))
-        weights = np.full(per_period, step * self.periods, dtype=float)
+        step = period / samples_per_period
+        times = np.asarray(self.ramp + step * np.arange(samples_per_period))
+        weights = np.full(samples_per_period, step * self.periods, dtype=float)
         if self.ramp == 0.0:
             return times, weights
         points = max(24, int(np.ceil(self.ramp / step)))
@@ -409,17 +409,17 @@ class PostureBasis:
         """Return the coefficients of standing still at a posture of shape (joints,), shape (joints, postures)."""
         return np.repeat(posture[:, None], self.postures, axis=1)
 
-    def still(self, coefficients: Array) -> Array:
+    def standing_at_middle(self, coefficients: Array) -> Array:
         """Return the coefficients of standing still at a motion's mean posture, shape (joints, postures)."""
         return self.standing(coefficients.mean(axis=1))
 
-    def samples(self, per_period: int) -> tuple[Array, Array]:
-        """Return `per_period` times [s] over the whole motion, with equal weights [s]."""
+    def samples(self, samples_per_period: int) -> tuple[Array, Array]:
+        """Return `samples_per_period` times [s] over the whole motion, with equal weights [s]."""
         duration = self.dwell * (len(self.times) + 1) + sum(self.times)
-        step = duration / per_period
-        return np.asarray(step * (np.arange(per_period) + 0.5)), np.full(per_period, step, dtype=float)
+        step = duration / samples_per_period
+        return np.asarray(step * (np.arange(samples_per_period) + 0.5)), np.full(samples_per_period, step, dtype=float)
 
 
-def maps(basis: Basis, times: Array) -> tuple[Array, Array, Array, Array]:
+def basis_values(basis: Basis, times: Array) -> tuple[Array, Array, Array, Array]:
     """Return the values of all basis functions and of their first three derivatives, each of shape (samples, size)."""
     return basis.path(np.eye(basis.size)).at(times)

@@ -33,7 +33,7 @@ from ident_service.fleet.factor import (
     merge,
     merge_stored,
     packed,
-    trimmed,
+    releasing_memory,
     unpacked,
 )
 from ident_service.fleet.population import (
@@ -177,10 +177,15 @@ class ArmFits:
     merged: Merged | None
 
 
-@trimmed
+@releasing_memory
 @one_blas_thread()
 def arm_fits(
-    leaves: Leaves, described: Described, store: Store, between: Array, trained: _Given = None, held: _Given = None
+    leaves: Leaves,
+    described: Described,
+    store: Store,
+    between_recordings: Array,
+    trained_factors: _Given = None,
+    held_out_factors: _Given = None,
 ) -> ArmFits | tuple[str, ...]:
     """Fit an arm to all its recordings, to those not held out, and to the first; or return the keys of missing factors.
 
@@ -188,19 +193,19 @@ def arm_fits(
         leaves: factors of the arm.
         described: the arm.
         store: of the factors.
-        between: variance of what differs from recording to recording [SI^2], shape (base,).
-        trained: information of the factors that are fitted to, as of `Branches.before`.
-        held: information of the factors held out, as of `Branches.before`.
+        between_recordings: variance of what differs from recording to recording [SI^2], shape (base,).
+        trained_factors: information of the factors that are fitted to, as of `Branches.before`.
+        held_out_factors: information of the factors held out, as of `Branches.before`.
 
     Returns:
         The fits; or the keys of the factors that are not there, or are damaged.
     """
-    branches = Branches(leaves, described, store, (trained, held))
+    branches = Branches(leaves, described, store, (trained_factors, held_out_factors))
     keys, whole = leaves.keys, leaves.by_recording
 
     def fit(information: Callable[[], Merged], of: Sequence[str], whole: bool) -> ArmFit:
         found = stored_fit(information, (tuple(of), whole), described, store)
-        return found if whole else found.weighed(between / len(of))
+        return found if whole else found.weighed(between_recordings / len(of))
 
     judged: tuple[Merged | None, tuple[float, float]] = (None, (np.nan, np.nan))
     try:
@@ -220,10 +225,10 @@ def reported_fits(fits: ArmFits | tuple[str, ...]) -> tuple[ArmFit, ArmFit] | tu
 
 
 def population_of(
-    fits_of: Mapping[str, tuple[ArmFit, ArmFit]], number: int, groups: Mapping[Group, Sequence[int]]
+    fits_of: Mapping[str, tuple[ArmFit, ArmFit]], fit_index: int, groups: Mapping[Group, Sequence[int]]
 ) -> Population:
     """Estimate the common model of a fleet from each arm's fit number 0 (all recordings) or 1 (not held out)."""
-    return population({arm: fits[number] for arm, fits in fits_of.items()}, groups)
+    return population({arm: fits[fit_index] for arm, fits in fits_of.items()}, groups)
 
 
 @one_blas_thread()
@@ -256,17 +261,21 @@ def _stored_name(kind: str, described: Described, *more: Any) -> str:
 
 
 def stored_fit(
-    information: Callable[[], Merged], of: tuple[tuple[str, ...], bool], described: Described, store: Store
+    information: Callable[[], Merged],
+    keys_and_clustering: tuple[tuple[str, ...], bool],
+    described: Described,
+    store: Store,
 ) -> ArmFit:
     """Return the fit of merged factors from the store; where it is absent or damaged, compute and store it.
 
     Args:
         information: function that returns the merged factors.
-        of: keys of the factors, in the order in which they are merged, and whether each recording is one cluster.
+        keys_and_clustering: keys of the factors, in the order in which they are merged, and whether each recording is
+            one cluster.
         described: the arm.
         store: of the factors.
     """
-    name = _stored_name("fit.npz", described, of)
+    name = _stored_name("fit.npz", described, keys_and_clustering)
     content = store.read(name)
     if content is not None:
         try:
@@ -327,9 +336,9 @@ def arm_files(
     fits: ArmFits,
     recordings: Sequence[tuple[str, str]],
     described: Described,
-    found: Population,
-    config: str,
-    more: dict[str, Any],
+    common_model: Population,
+    description_json: str,
+    fleet_fields: dict[str, Any],
     store: Store,
     shown: ArmShown,
 ) -> tuple[Files, dict[str, Any]]:
@@ -339,9 +348,9 @@ def arm_files(
         fits: of the arm.
         recordings: name and hash of each.
         described: the arm, with numbers for all that could be chosen.
-        found: common model of all arms.
-        config: the description as it was read, as JSON.
-        more: fields of the summary that come from the fleet: `arm`, `pooled`, `arms`, `held_out_percent`.
+        common_model: common model of all arms.
+        description_json: the description as it was read, as JSON.
+        fleet_fields: fields of the summary that come from the fleet: `arm`, `pooled`, `arms`, `held_out_percent`.
         store: of the factors.
         shown: further content of the page.
     """
@@ -350,9 +359,15 @@ def arm_files(
     def information() -> Merged:
         return Branches(leaves, described, store).merged if fits.merged is None else fits.merged
 
-    pooled = pooled_fit(fits.fit, found.other_arms(more["arm"]), found.scale) if more["arms"] > 1 else None
+    pooled = (
+        pooled_fit(fits.fit, common_model.other_arms(fleet_fields["arm"]), common_model.scale)
+        if fleet_fields["arms"] > 1
+        else None
+    )
     of = (leaves.keys, leaves.by_recording)
-    return _files(fits.fit, information, of, recordings, described, pooled, config, more, store, shown)
+    return _files(
+        fits.fit, information, of, recordings, described, pooled, description_json, fleet_fields, store, shown
+    )
 
 
 def side_files(
@@ -360,8 +375,8 @@ def side_files(
     merged: Merged | None,
     recordings: Sequence[tuple[str, str]],
     described: Described,
-    config: str,
-    more: dict[str, Any],
+    description_json: str,
+    fleet_fields: dict[str, Any],
     store: Store,
 ) -> Files:
     """Build the result files of some recordings, by name; the estimate is read from the store, or kept there.
@@ -371,8 +386,8 @@ def side_files(
         merged: merged factors, where further tasks merged them; else None.
         recordings: name and hash of each.
         described: the arm, with numbers for all that could be chosen.
-        config: the description as it was read, as JSON.
-        more: fields of the summary that come from the fleet: `arm`, `pooled`, `arms`.
+        description_json: the description as it was read, as JSON.
+        fleet_fields: fields of the summary that come from the fleet: `arm`, `pooled`, `arms`.
         store: of the factors.
     """
 
@@ -382,7 +397,7 @@ def side_files(
 
     of = (keys, False)
     fit = stored_fit(information, of, described, store)
-    return _files(fit, information, of, recordings, described, None, config, more, store)[0]
+    return _files(fit, information, of, recordings, described, None, description_json, fleet_fields, store)[0]
 
 
 def _files(

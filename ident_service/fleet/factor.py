@@ -256,7 +256,7 @@ class Described:
         """Return the hash that names the factor of a recording's piece in the store, by its content and description."""
         return _hash(str(_FORMAT), sha256, f"{part.number}/{part.of}", self.config.sha256)
 
-    def seen(self, part: Part) -> str:
+    def seen_note_path(self, part: Part) -> str:
         """Return the path in the store of the note that holds the factor's key for this version of a file."""
         source = part.source
         return f"{SEEN}/{_hash(str(_FORMAT), source.url, source.state, f'{part.number}/{part.of}', self.config.sha256)}"
@@ -307,7 +307,7 @@ class Settled:
     pilots: tuple[str, ...]
 
 
-def trimmed(task: Callable[_Given, _Found]) -> Callable[_Given, _Found]:
+def releasing_memory(task: Callable[_Given, _Found]) -> Callable[_Given, _Found]:
     """Wrap a task so that freed memory stays for the next one, and goes back to the system after some tasks.
 
     Dask's workers give everything back at once, so that a sixth of a task's time would go into having the same pages
@@ -323,12 +323,12 @@ def trimmed(task: Callable[_Given, _Found]) -> Callable[_Given, _Found]:
             return task(*given, **named)
         finally:
             if next(done) % _TRIMMED_EVERY == 0:
-                give_back()
+                release_unused_memory()
 
     return run
 
 
-def give_back() -> None:
+def release_unused_memory() -> None:
     """Return unused heap memory to the system, if glibc; the first use also makes glibc keep freed memory later on."""
     if (trim := _malloc_trim()) is not None:
         trim(0)
@@ -347,18 +347,18 @@ def _malloc_trim() -> Any:
     return trim
 
 
-def settle(sources: Sequence[Source], description: str) -> Settled | tuple[Problem, ...]:
+def settle(sources: Sequence[Source], description_json: str) -> Settled | tuple[Problem, ...]:
     """Replace automatic choices in a description by numbers from the first usable recordings; else return problems.
 
     Args:
         sources: recordings of one arm.
-        description: the description as JSON.
+        description_json: the description as JSON.
 
     Returns:
         The settled description; or what is wrong, where no recording can be used, or the usable ones cannot be fitted
         together.
     """
-    config = ArmConfig.model_validate_json(description)
+    config = ArmConfig.model_validate_json(description_json)
     model = arm_model(config)
     base = base_parameters(model.chain, model.layout)
     problems: list[Problem] = []
@@ -396,10 +396,10 @@ def settle(sources: Sequence[Source], description: str) -> Settled | tuple[Probl
     return Settled(settled.model_dump_json(), tuple(pilots))
 
 
-@trimmed
+@releasing_memory
 @one_blas_thread()
 def reduce_recording(
-    part: Part, described: Described, store: Store, client_version: str, again: bool = False
+    part: Part, described: Described, store: Store, client_version: str, recompute: bool = False
 ) -> Outcome:
     """Reduce a recording or piece to factor and row in the store, unless there; return row or what is wrong with it.
 
@@ -408,21 +408,21 @@ def reduce_recording(
         described: the arm, with numbers for all that could be chosen.
         store: of the factors.
         client_version: version of the client's package.
-        again: whether to compute it although it is there.
+        recompute: whether to compute it although it is there.
     """
     source = part.source
     if client_version != __version__:
         text = f"this worker has ident-service {__version__}, the client {client_version}; install the same"
         return Outcome(part, None, Problem(source.url, part.label, "version", text))
-    seen = described.seen(part)
-    noted = None if again else store.read(seen)
+    seen = described.seen_note_path(part)
+    noted = None if recompute else store.read(seen)
     if noted is not None and (row := stored_row(store, noted.decode(errors="replace"))) is not None:
         return Outcome(part, row, computed=False)
     try:
         with local_copy(source) as path:
             recording = open_for_arm(path, described.model)
             key = described.key(recording.sha256, part)
-            row = None if again else stored_row(store, key)
+            row = None if recompute else stored_row(store, key)
             computed = row is None
             if row is None:
                 if part.of > 1:
@@ -441,7 +441,7 @@ def reduce_recording(
 
 def stored_rows(parts: Sequence[Part], described: Described, store: Store) -> list[Row | None]:
     """Return the stored row of each part whose file is unchanged; None for each part that has to be reduced."""
-    noted = [store.read(described.seen(part)) for part in parts]
+    noted = [store.read(described.seen_note_path(part)) for part in parts]
     return [None if note is None else stored_row(store, note.decode(errors="replace")) for note in noted]
 
 
@@ -489,7 +489,7 @@ def _reduced(recording: Recording, key: str, label: str, described: Described) -
     seen = _require_usable(recording, model)
     gathered = equations(recording, model, base)
     shares = standstill_weights(gathered)
-    fitted = gathered.with_near(shares)
+    fitted = gathered.with_standstill_rows(shares)
     method = model.config.identification.method
     fit: LeastSquares = (ordinary_least_squares if method == "ols" else weighted_least_squares)(fitted.total)
     if method == "huber":
@@ -610,18 +610,22 @@ def unpacked(content: bytes, described: Described) -> Merged:
     return Merged(parts[0], parts[1], tuple(parts[2:]), samples)
 
 
-@trimmed
+@releasing_memory
 @one_blas_thread()
-def merge_stored(keys: Sequence[str], described: Described, store: Store, whole: bool) -> Merged | tuple[str, ...]:
+def merge_stored(
+    keys: Sequence[str], described: Described, store: Store, cluster_by_recording: bool
+) -> Merged | tuple[str, ...]:
     """Merge stored factors in a tree, in the order given; return the keys that are missing or damaged instead, if any.
 
     Args:
         keys: of the factors.
         described: the arm.
         store: store of the factors.
-        whole: whether a recording is one cluster, for arms with enough of them.
+        cluster_by_recording: whether a recording is one cluster, for arms with enough of them.
     """
-    level = [_merge_leaf(keys[k : k + FAN_IN], described, store, whole) for k in range(0, len(keys), FAN_IN)]
+    level = [
+        _merge_leaf(keys[k : k + FAN_IN], described, store, cluster_by_recording) for k in range(0, len(keys), FAN_IN)
+    ]
     while len(level) > 1:
         level = [merge(level[k : k + FAN_IN]) for k in range(0, len(level), FAN_IN)]
     return level[0]

@@ -40,7 +40,7 @@ from ident_service.fleet.reduction import (
     Step,
     Tell,
     absolute_url,
-    connected,
+    dask_client,
     list_recordings,
     merged_on_workers,
     reduce_again,
@@ -89,7 +89,7 @@ def identify_fleet(
     listed = list_recordings(request)  # what cannot be is refused before workers start
     for arm, _ in listed.whose.values():
         _require_file_name(arm)
-    with connected(request, tell) as client:
+    with dask_client(request, tell) as client:
         reduced = reduce_fleet(client, request, listed, tell, step)
         result, written, splits = _analysed(client, request, reduced, folder, tell, step)
     with replacing_folder(folder, _require_replaceable) as staging:
@@ -130,7 +130,8 @@ def _fitted(
         for arm in waiting:
             keys, count, whole = leaves[arm].keys, leaves[arm].count, leaves[arm].by_recording
             trees = [
-                merged_on_workers(client, of, described, store, whole=whole) for of in (keys[:count], keys[count:])
+                merged_on_workers(client, of, described, store, cluster_by_recording=whole)
+                for of in (keys[:count], keys[count:])
             ]
             fitting[arm] = client.submit(arm_fits, leaves[arm], described, store, between, *trees, pure=False)
             telling[arm] = client.submit(reported_fits, fitting[arm], pure=False)
@@ -214,7 +215,7 @@ def _split_files(
     recordings = reduced.arms[arm]
     for part in (recordings[: change.at], recordings[change.at :]):
         keys = reduced.keys_of(part)
-        merged = merged_on_workers(client, keys, described, store, whole=False)
+        merged = merged_on_workers(client, keys, described, store, cluster_by_recording=False)
         names = [(one.name, one.row.sha256) for one in part]
         more = {"arm": arm, "pooled": False, "arms": len(reduced.arms)}
         found.append(client.submit(side_files, keys, merged, names, described, config, more, store, pure=False))

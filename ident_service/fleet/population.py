@@ -52,9 +52,9 @@ from ident_service.estimation.least_squares import (
 from ident_service.estimation.uncertainty import (
     Uncertainty,
     negligible,
+    student_factors,
     uncertainty,
     verdicts,
-    widening,
 )
 from ident_service.fleet.factor import Described, Merged, Row
 from ident_service.model.blas_threads import one_blas_thread
@@ -104,13 +104,13 @@ class ArmFit:
         precision = fit.R1.T @ fit.R1 / (max(variance, np.finfo(float).tiny) * doubt.inflation)
         return cls(fit, doubt, clusters, precision, total, error)
 
-    def weighed(self, between: Array) -> ArmFit:
-        """Return a copy with its precision lowered by `between`, the variance of the arm's mean between recordings.
+    def weighed(self, between_variance: Array) -> ArmFit:
+        """Return a copy with its precision lowered by the variance of the arm's mean between recordings.
 
         Args:
-            between: variance of the arm's mean by that [SI^2], shape (base,).
+            between_variance: variance of the arm's mean by that [SI^2], shape (base,).
         """
-        return replace(self, precision=_widened(self.precision, between))
+        return replace(self, precision=_widened(self.precision, between_variance))
 
     @property
     def right(self) -> Array:
@@ -320,30 +320,30 @@ def _drawn_to_group(own: Array, variances: Array, expected: Array, share: Array,
     return np.asarray((weight * own + _GROUP_ARMS * of_group) / (weight + _GROUP_ARMS))
 
 
-def pooled_fit(alone: ArmFit, prior: tuple[Array, Array, Array], scale: Array) -> LeastSquares:
+def pooled_fit(alone: ArmFit, other_arms: tuple[Array, Array, Array], parameter_scales: Array) -> LeastSquares:
     """Return an arm's estimate combined with the other arms' as a prior, as least squares with unit noise.
 
     Args:
         alone: the arm's own.
-        prior: mean, its covariance and T, in units of `scale`.
-        scale: D, shape (base,).
+        other_arms: mean, its covariance and T, in units of `parameter_scales`.
+        parameter_scales: D, shape (base,).
     """
-    mean, covariance, variances = prior
+    mean, covariance, variances = other_arms
     around = np.linalg.inv(covariance + np.diag(variances))
-    P = alone.precision * np.outer(scale, scale)
+    P = alone.precision * np.outer(parameter_scales, parameter_scales)
     information = P + 0.5 * (around + around.T)
     inverse = np.linalg.inv(np.linalg.cholesky(information))  # L^-1, and R1 = L^T
-    beta = inverse.T @ (inverse @ (alone.right * scale + around @ mean))
-    R1 = np.linalg.cholesky(information).T / scale
-    beta = beta * scale
+    beta = inverse.T @ (inverse @ (alone.right * parameter_scales + around @ mean))
+    R1 = np.linalg.cholesky(information).T / parameter_scales
+    beta = beta * parameter_scales
     return LeastSquares(
         beta=beta,
         R1=R1,
         rho1=R1 @ beta,
         rho2=0.0,
-        inverse=inverse.T * scale[:, None],
+        inverse=inverse.T * parameter_scales[:, None],
         rank=len(beta),
-        standard_deviations=np.linalg.norm(inverse.T * scale[:, None], axis=1),
+        standard_deviations=np.linalg.norm(inverse.T * parameter_scales[:, None], axis=1),
         weights=alone.fit.weights,
     )
 
@@ -364,30 +364,30 @@ def arm_estimate(
     merged: Merged,
     recordings: Sequence[tuple[str, str]],
     described: Described,
-    drawn: LeastSquares | None = None,
-    arms: int = 1,
+    pooled: LeastSquares | None = None,
+    arm_count: int = 1,
 ) -> Estimate:
-    """Return one arm's estimate inside its feasible set, from `drawn` (pooled) where given, else from `alone`.
+    """Return one arm's estimate inside its feasible set, from `pooled` where given, else from `alone`.
 
     Args:
         alone: unconstrained estimate of the arm alone.
         merged: merged factors of the arm.
         recordings: name and hash of each.
         described: the arm.
-        drawn: the arm's own estimate after it was drawn to the fleet's; None for the arm alone.
-        arms: number of arms in the fleet, which sets the degrees of freedom where `drawn` is given.
+        pooled: the arm's own estimate after it was drawn to the fleet's; None for the arm alone.
+        arm_count: number of arms in the fleet, which sets the degrees of freedom where `pooled` is given.
 
     Raises:
         SolverError: the solver stopped without an optimum.
     """
     model, base, conditions = described.model, described.base, _conditions(described)
-    fit = alone.fit if drawn is None else drawn
+    fit = alone.fit if pooled is None else pooled
     held = constrained_least_squares(fit, base, conditions)
-    degrees = alone.doubt.degrees if drawn is None else np.full(base.size, max(arms - 2.0, 1.0))
-    deviations = alone.doubt.deviations if drawn is None else drawn.standard_deviations * widening(degrees)
-    covariance = alone.doubt.covariance if drawn is None else drawn.inverse @ drawn.inverse.T
+    degrees = alone.doubt.degrees if pooled is None else np.full(base.size, max(arm_count - 2.0, 1.0))
+    deviations = alone.doubt.deviations if pooled is None else pooled.standard_deviations * student_factors(degrees)
+    covariance = alone.doubt.covariance if pooled is None else pooled.inverse @ pooled.inverse.T
     likely = likely_bodies(model)
-    near = allowed_change(fit, base, deviations, held.beta) if held.tight and drawn is None else None
+    near = allowed_change(fit, base, deviations, held.beta) if held.tight and pooled is None else None
     held = held.centred(base, conditions, likely, near)
     everything, moving = merged.everything, merged.moving
     found = [
@@ -462,34 +462,36 @@ class Unlike:
 @one_blas_thread()
 def unlike(
     fits: Mapping[str, ArmFit],
-    found: Population,
+    common_model: Population,
     groups: Mapping[Group, Sequence[int]],
-    leading: tuple[str, ...],
+    leading_names: tuple[str, ...],
 ) -> list[Unlike]:
     """Test for every arm and group if the arm differs from the others; return all tests, none under three arms.
 
     Args:
         fits: fit of each arm alone.
-        found: the common model.
+        common_model: the common model.
         groups: indices of each group's parameters.
-        leading: link parameter that each base parameter is named after.
+        leading_names: link parameter that each base parameter is named after.
     """
     every = []
-    if len(found.arms) < 3:
+    if len(common_model.arms) < 3:
         return []
     for arm, alone in fits.items():
-        mean, covariance, variances = found.other_arms(arm)
-        D = np.outer(found.scale, found.scale)
-        others = ComparedEstimate(leading, mean * found.scale, (covariance + np.diag(variances)) * D, len(fits) - 1)
+        mean, covariance, variances = common_model.other_arms(arm)
+        D = np.outer(common_model.scale, common_model.scale)
+        others = ComparedEstimate(
+            leading_names, mean * common_model.scale, (covariance + np.diag(variances)) * D, len(fits) - 1
+        )
         own_covariance = _variances_of(alone)
-        own = ComparedEstimate(leading, alone.fit.beta, own_covariance, max(alone.clusters, 2))
+        own = ComparedEstimate(leading_names, alone.fit.beta, own_covariance, max(alone.clusters, 2))
         motion = Motion.of(alone.total, alone.fit.beta)
         for group, places in groups.items():
             test = difference_test(others, own, places)
             only = np.zeros(len(mean))
             seen = [k for k in places if np.isfinite(own_covariance[k, k])]
             only[seen] = (own.values - others.values)[seen]
-            change = motion.change(only)
+            change = motion.torque_change(only)
             share = change / np.maximum(motion.torque, np.finfo(float).tiny)
             joint = int(np.argmax(share))
             every.append(Unlike(arm, group, test, 1.0, float(change[joint]), joint, float(share[joint])))

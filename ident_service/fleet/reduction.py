@@ -35,16 +35,16 @@ from ident_service.fleet.factor import (
     Problem,
     Row,
     Settled,
-    give_back,
     merge,
     merge_stored,
     reduce_recording,
+    release_unused_memory,
     require_mergeable,
     settle,
     stored_row,
     stored_rows,
 )
-from ident_service.fleet.storage import Source, Store, find
+from ident_service.fleet.storage import Source, Store, find_files
 
 _Result = TypeVar("_Result")
 Tell = Callable[[str], None]
@@ -138,7 +138,7 @@ class Reduced:
 
 
 @contextmanager
-def connected(request: FleetRequest, tell: Tell) -> Iterator[Client]:
+def dask_client(request: FleetRequest, tell: Tell) -> Iterator[Client]:
     """Yield a Dask client of the given scheduler, or of workers started here; raises if none, or of another version.
 
     Raises:
@@ -197,7 +197,7 @@ def _reporting_paused_workers(client: Client, tell: Tell) -> Iterator[None]:
                 workers = client.scheduler_info(n_workers=-1)["workers"]
                 paused = {address for address, of in workers.items() if of.get("status") == "paused"}
                 if paused:
-                    client.run(give_back, workers=list(paused), on_error="ignore")
+                    client.run(release_unused_memory, workers=list(paused), on_error="ignore")
             except (OSError, TimeoutError, ValueError):
                 continue  # the call that waits for the scheduler says so
             for address in sorted(paused & before - named):
@@ -238,12 +238,12 @@ def _require_workers(client: Client, address: str, tell: Tell) -> None:
     tell(f"{len(versions['workers'])} workers of {address}, dashboard {client.dashboard_link}")
 
 
-def result_of(future: Future, what: str) -> Any:
+def result_of(future: Future, task_words: str) -> Any:
     """Wait for a Dask task and return its result; raises Unavailable if it ended every worker that tried.
 
     Args:
         future: future of the task.
-        what: description of the task, for the error.
+        task_words: description of the task, for the error.
 
     Raises:
         Unavailable: it ended every worker that tried.
@@ -251,11 +251,14 @@ def result_of(future: Future, what: str) -> Any:
     try:
         return future.result()
     except KilledWorker:
-        raise Unavailable(f"{what} ended every worker that tried; give workers more with --memory") from None
+        raise Unavailable(f"{task_words} ended every worker that tried; give workers more with --memory") from None
 
 
 def results_as_completed(
-    client: Client, function: Callable[..., _Result], tasks: Sequence[tuple[Any, ...]], failed: Callable[[int], _Result]
+    client: Client,
+    function: Callable[..., _Result],
+    tasks: Sequence[tuple[Any, ...]],
+    result_of_failed: Callable[[int], _Result],
 ) -> Iterator[tuple[int, _Result]]:
     """Run a function on Dask for each tuple of arguments; yield (task's number, result) in order of completion.
 
@@ -263,7 +266,7 @@ def results_as_completed(
         client: of the scheduler.
         function: function to run; running it twice does nothing more.
         tasks: arguments of each task.
-        failed: function that returns the result of a task, by its number, whose every worker died.
+        result_of_failed: function that returns the result of a task, by its number, whose every worker died.
     """
     workers = max(len(client.scheduler_info(n_workers=-1)["workers"]), 1)
     waiting = iter(range(len(tasks)))
@@ -281,7 +284,7 @@ def results_as_completed(
         try:
             result = future.result()
         except KilledWorker:
-            result = failed(number)
+            result = result_of_failed(number)
         except ModuleNotFoundError as error:
             raise UsageError(
                 f"a worker lacks what this package needs: {error}; install ident-service[fleet] there"
@@ -317,7 +320,7 @@ def list_recordings(request: FleetRequest) -> Listed:
     config = load_arm(request.arm)
     require_mergeable(config)
     named = _naming(request.names)
-    sources = find(request.patterns)
+    sources = find_files(request.patterns)
     return Listed(config, sources, {source.url: named(source.url) for source in sources})
 
 
@@ -510,7 +513,7 @@ def reduce_again(client: Client, reduced: Reduced, keys: Collection[str], store:
 
 
 def merged_on_workers(
-    client: Client, keys: Sequence[str], described: Described, store: Store, *, whole: bool
+    client: Client, keys: Sequence[str], described: Described, store: Store, *, cluster_by_recording: bool
 ) -> Future | None:
     """Start tasks that merge factors in a tree; return the last one's future. Start none, return None, for few.
 
@@ -521,12 +524,12 @@ def merged_on_workers(
         keys: of the factors, in the order in which they are merged.
         described: the arm.
         store: of the factors.
-        whole: as for `merge_stored`.
+        cluster_by_recording: as for `merge_stored`.
     """
     if len(keys) <= AT_ONCE:
         return None
     level = [
-        client.submit(merge_stored, keys[k : k + AT_ONCE], described, store, whole, pure=False)
+        client.submit(merge_stored, keys[k : k + AT_ONCE], described, store, cluster_by_recording, pure=False)
         for k in range(0, len(keys), AT_ONCE)
     ]
     while len(level) > 1:
@@ -543,7 +546,7 @@ def status_of(request: FleetRequest) -> Mapping[str, Any]:
     """
     config = load_arm(request.arm)
     store = Store(absolute_url(request.store))
-    sizes = [size for _, size in store.names(FACTORS)]
+    sizes = [size for _, size in store.list_files(FACTORS)]
     answer: dict[str, Any] = {"store": store.url, "factors": len(sizes), "bytes": sum(sizes)}
     kept = store.read(f"{SETTLED}/{config.sha256}.json")
     answer |= {"settled": kept is not None, "settled_by": None if kept is None else kept.decode().partition("\n")[0]}
@@ -553,7 +556,7 @@ def status_of(request: FleetRequest) -> Mapping[str, Any]:
     arms: dict[str, dict[str, int]] = {}
     new: list[str] = []
     described = None if kept is None else Described(kept.decode().partition("\n")[2])
-    for source in find(request.patterns):
+    for source in find_files(request.patterns):
         entry = arms.setdefault(named(source.url)[0], {"recordings": 0, "reduced": 0})
         entry["recordings"] += 1
         count = max(1, -(-source.size // request.piece_bytes))
@@ -565,5 +568,5 @@ def status_of(request: FleetRequest) -> Mapping[str, Any]:
 
 
 def _is_stored(store: Store, described: Described, part: Part) -> bool:
-    noted = store.read(described.seen(part))
+    noted = store.read(described.seen_note_path(part))
     return noted is not None and stored_row(store, noted.decode(errors="replace")) is not None

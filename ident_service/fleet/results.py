@@ -21,7 +21,7 @@ from ident_service.fleet.arm_page import PAGE as PAGE
 from ident_service.fleet.factor import Described
 from ident_service.fleet.population import Group, HeldOut, Population, Shares, Unlike
 from ident_service.fleet.reduction import FleetRequest, Recorded, Reduced
-from ident_service.fleet.trends import Change, Compared, series
+from ident_service.fleet.trends import Change, Compared, parameter_series
 from ident_service.model.chain import Array
 from ident_service.operations.drift_alarms import FLEET as FLEET
 
@@ -303,10 +303,10 @@ def _of_recording(one: Recorded, summary: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def drawing(points: Array, common: float, change: Change | None) -> dict[str, Any]:
+def drawing(points: Array, fleet_mean: float, change: Change | None) -> dict[str, Any]:
     """Return the pixel coordinates of one small plot: values with intervals over time, fleet's mean, a change."""
     low, high = float((points[:, 1] - points[:, 2]).min()), float((points[:, 1] + points[:, 2]).max())
-    low, high = min(low, common), max(high, common)
+    low, high = min(low, fleet_mean), max(high, fleet_mean)
     first, last = float(points[0, 0]), float(points[-1, 0])
     room = (high - low) or 1.0
 
@@ -319,7 +319,7 @@ def drawing(points: Array, common: float, change: Change | None) -> dict[str, An
     return {
         "bars": [(x(at), y(value - half), y(value + half), y(value)) for at, value, half in points.tolist()],
         "line": " ".join(f"{x(at)},{y(value)}" for at, value, _ in points.tolist()),
-        "common": y(common),
+        "common": y(fleet_mean),
         "change": None if change is None or change.drift else x(0.5 * (change.before + change.after)),
         "drift": change is not None and change.drift,
         "low": f"{low:.3g}",
@@ -330,7 +330,7 @@ def drawing(points: Array, common: float, change: Change | None) -> dict[str, An
 
 
 def arm_trends(
-    arm: str, reduced: Reduced, compared: Compared, common: Array, most: int | None = None
+    arm: str, reduced: Reduced, compared: Compared, common_beta: Array, most_groups: int | None = None
 ) -> list[dict[str, Any]]:
     """Return small plots of one arm: per group the parameter that changed most, likeliest changes first.
 
@@ -338,33 +338,33 @@ def arm_trends(
         arm: name.
         reduced: fleet with its recordings.
         compared: the tests over time.
-        common: base parameters that are common [SI], shape (base,).
-        most: number of groups; all when None.
+        common_beta: base parameters that are common [SI], shape (base,).
+        most_groups: number of groups; all when None.
     """
     described, groups = reduced.described, reduced.described.groups
     numbers = {group: number for number, group in enumerate(groups)}
     of_arm = sorted(compared.changes_of(arm), key=lambda one: (one.p, -one.statistic))
     figures = []
-    for one in of_arm[:most]:
+    for one in of_arm[:most_groups]:
         index = int(np.argmax(np.abs(one.step) / np.maximum(one.deviations, np.finfo(float).tiny)))
         place = groups[one.group][index]
-        points = series(reduced.arms[arm], place, numbers[one.group], index, compared.scatter[one.group])
+        points = parameter_series(reduced.arms[arm], place, numbers[one.group], index, compared.scatter[one.group])
         thin = points[np.unique(np.linspace(0, len(points) - 1, min(len(points), _POINTS)).round().astype(int))]
         what = f"{described.base.expressions[place]} [{described.base.units[place] or '-'}]"
         title = group_name(one.group, described)
-        drawn = drawing(thin, float(common[place]), one if one.changed else None)
+        drawn = drawing(thin, float(common_beta[place]), one if one.changed else None)
         figures.append({"what": what, "title": title, "p": one.p, "changed": one.changed, **drawn})
     return figures
 
 
-def shown_of(arm: str, reduced: Reduced, compared: Compared, common: Array) -> ArmShown:
+def shown_of(arm: str, reduced: Reduced, compared: Compared, common_beta: Array) -> ArmShown:
     """Return what an arm's page shows besides its estimate: its recordings (of many, those with warnings), trends."""
     rows = []
     for one in reduced.arms[arm]:
         row, when = one.row, _when(one.at)[:16].replace("T", " ")
         rows.append((one.name, when, row.seconds, row.rate, row.error, "; ".join(row.warnings)))
     listed = rows if len(rows) <= _ALL_LISTED else [one for one in rows if one[-1]]
-    return ArmShown(arm, listed, arm_trends(arm, reduced, compared, common))
+    return ArmShown(arm, listed, arm_trends(arm, reduced, compared, common_beta))
 
 
 def _trends(result: FleetResult) -> list[dict[str, Any]]:

@@ -66,19 +66,19 @@ def _system(url: str) -> tuple[Any, str]:
     return system, path
 
 
-def persistently(action: Callable[[], _Result], url: str, pauses: Sequence[float] = PAUSES) -> _Result:
+def with_retries(action: Callable[[], _Result], url: str, pause_seconds: Sequence[float] = PAUSES) -> _Result:
     """Call a function that uses storage, again after pauses for transient errors; return its result or raise.
 
     Args:
         action: function to call; it can be repeated.
         url: URL for messages.
-        pauses: waiting times before each further attempt [s].
+        pause_seconds: waiting times before each further attempt [s].
 
     Raises:
         FileNotFoundError: there is no such file.
         StorageError: it failed every time, or for a reason that does not pass.
     """
-    for pause in (*pauses, None):
+    for pause in (*pause_seconds, None):
         try:
             return action()
         except FileNotFoundError:
@@ -88,13 +88,13 @@ def persistently(action: Callable[[], _Result], url: str, pauses: Sequence[float
             if not (foreign or isinstance(error, OSError)):
                 raise
             if pause is None or isinstance(error, _FINAL):
-                tries = "" if isinstance(error, _FINAL) else f", {len(pauses) + 1} times"
+                tries = "" if isinstance(error, _FINAL) else f", {len(pause_seconds) + 1} times"
                 raise StorageError(url, f"cannot be reached{tries}: {error or type(error).__name__}") from error
             time.sleep(pause)
     raise AssertionError("unreachable")
 
 
-def find(patterns: Sequence[str]) -> list[Source]:
+def find_files(patterns: Sequence[str]) -> list[Source]:
     """Return the files that patterns name (files, globs, folders), by URL, each once; UsageError if one names none.
 
     Raises:
@@ -104,7 +104,7 @@ def find(patterns: Sequence[str]) -> list[Source]:
     found: dict[str, Source] = {}
     for pattern in patterns:
         system, path = _system(pattern)
-        listed = persistently(lambda system=system, path=path: _listed(system, path), pattern)  # type: ignore[misc]
+        listed = with_retries(lambda system=system, path=path: _listed(system, path), pattern)  # type: ignore[misc]
         names = [name for name, info in listed.items() if info.get("type", "file") == "file"]
         if not names:
             raise UsageError(f"{pattern}: names no recording; give files, a pattern such as 'arms/*/*.mcap', or a URL")
@@ -161,7 +161,7 @@ def local_copy(source: Source) -> Iterator[Path]:
                 raise OSError(f"{copy.stat().st_size} of {source.size} bytes came")
 
         try:
-            persistently(fetch, source.url)
+            with_retries(fetch, source.url)
         except FileNotFoundError:
             raise StorageError(source.url, "is gone since it was listed") from None
         yield copy
@@ -185,7 +185,7 @@ class Store:
         """
         system, path = _system(self._place(name))
         try:
-            content: bytes = persistently(lambda: system.cat_file(path), self._place(name))
+            content: bytes = with_retries(lambda: system.cat_file(path), self._place(name))
         except FileNotFoundError:
             return None
         return content
@@ -216,17 +216,17 @@ class Store:
                     system.rm_file(partial)
                 raise
 
-        persistently(put, self._place(name))
+        with_retries(put, self._place(name))
 
-    def names(self, folder: str) -> Iterator[tuple[str, int]]:
+    def list_files(self, store_folder: str) -> Iterator[tuple[str, int]]:
         """Yield bare name and size [bytes] of every file below a folder of the store, sorted; none where it is absent.
 
         Raises:
             StorageError: storage cannot be reached.
         """
-        system, path = _system(self._place(folder))
+        system, path = _system(self._place(store_folder))
         try:
-            listed = persistently(lambda: system.find(path, detail=True), self._place(folder))
+            listed = with_retries(lambda: system.find(path, detail=True), self._place(store_folder))
         except FileNotFoundError:
             return
         for name, info in sorted(listed.items()):

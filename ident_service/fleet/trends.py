@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import ndtr
 
-from ident_service.estimation.change_detection import ALPHA, Kind, Motion, holm, probability, relevant
+from ident_service.estimation.change_detection import ALPHA, Kind, Motion, holm, p_value, relevant
 from ident_service.fleet.factor import CONDITIONS, Described
 from ident_service.fleet.population import ArmFit, Population, Unlike, unlike
 from ident_service.fleet.reduction import Recorded
@@ -195,7 +195,7 @@ def change_points(
             p, statistic, drift, at, step, deviations, times = found
             only = np.zeros(len(fits[arm].fit.beta))
             only[list(places)] = step
-            change, tiny = motion.change(only), np.finfo(float).tiny
+            change, tiny = motion.torque_change(only), np.finfo(float).tiny
             shares = change / np.maximum(motion.torque, tiny), change / np.maximum(motion.residual, tiny)
             joint = int(np.argmax(shares[0]))
             of_joint = (float(shares[0][joint]), float(shares[1][joint]))
@@ -253,7 +253,7 @@ def _most_likely(
     best = int(np.argmax(every))
     statistic, drift = float(every[best] / inflation[best]), best == len(splits)
     split = count // 2 if drift else int(splits[best])
-    p = min(probability(statistic, size, max(float(degrees[best]), size)) * len(shapes), 1.0)
+    p = min(p_value(statistic, size, max(float(degrees[best]), size)) * len(shapes), 1.0)
     times = (float(at[0]), float(at[-1])) if drift else (float(at[split - 1]), float(at[split]))
     return p, statistic, drift, seen[split], np.concatenate(steps)[best], np.concatenate(deviations)[best], times
 
@@ -355,35 +355,37 @@ class Compared:
 
 
 def compare_arms(
-    arms: Mapping[str, Sequence[Recorded]], fits: Mapping[str, ArmFit], found: Population, described: Described
+    arms: Mapping[str, Sequence[Recorded]], fits: Mapping[str, ArmFit], common_model: Population, described: Described
 ) -> Compared:
     """Test every arm of a fleet against the others and over time; return all tests with the scatter.
 
     Args:
         arms: recordings of each arm, by time.
         fits: fit of each arm alone.
-        found: the common model.
+        common_model: the common model.
         described: the arms.
     """
     groups = described.groups
     leading = tuple(described.base.names[column] for column in described.base.base)
     scatter = scatter_of(arms, groups)
     return Compared(
-        odd=unlike(fits, found, groups, leading),
+        odd=unlike(fits, common_model, groups, leading),
         changes=change_points(arms, fits, groups, scatter),
         dependences=dependences(arms, groups, scatter),
         scatter=scatter,
     )
 
 
-def series(recordings: Sequence[Recorded], place: int, number: int, index: int, scatter: Scatter) -> Array:
+def parameter_series(
+    recordings: Sequence[Recorded], base_index: int, group_index: int, index_in_group: int, scatter: Scatter
+) -> Array:
     """Return one parameter of one arm over time: rows of time [s since 1970], value, half its 95 % interval [SI].
 
     Args:
         recordings: of the arm, by time.
-        place: index of the base parameter.
-        number: number of its group.
-        index: index of the parameter in the group.
+        base_index: index of the base parameter.
+        group_index: index of its group.
+        index_in_group: index of the parameter in the group.
         scatter: scatter of the group, which the interval includes.
 
     Returns:
@@ -391,8 +393,8 @@ def series(recordings: Sequence[Recorded], place: int, number: int, index: int, 
     """
     found = []
     for one in recordings:
-        variance = float(one.row.covariances[number][index, index])
+        variance = float(one.row.covariances[group_index][index_in_group, index_in_group])
         if np.isfinite(variance):
-            half = _NORMAL * float(np.sqrt(scatter.factor * (variance + scatter.variances[index])))
-            found.append((one.at, float(one.row.beta[place]), half))
+            half = _NORMAL * float(np.sqrt(scatter.factor * (variance + scatter.variances[index_in_group])))
+            found.append((one.at, float(one.row.beta[base_index]), half))
     return np.array(found).reshape(len(found), 3)

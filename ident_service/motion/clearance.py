@@ -23,7 +23,7 @@ import numpy as np
 from ident_service.config.motion_limits import MotionLimits, Vector
 from ident_service.errors import MotionRefused
 from ident_service.excitation.limit_proof import Clearance, certified_along, certified_clearance
-from ident_service.excitation.trajectory import Path
+from ident_service.excitation.trajectory import MotionPath
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.capsule_distances import CapsuleModel
 from ident_service.model.collision import CollisionModel
@@ -145,7 +145,7 @@ def trajectory_clearance(
     return certified_along(collision, position, limits.velocity, reference.duration, least)
 
 
-def motion_stop_clearance(path: Path, limits: MotionLimits, model: ArmModel) -> Nearest:
+def motion_stop_clearance(path: MotionPath, limits: MotionLimits, model: ArmModel) -> Nearest:
     """Return the smallest capsule distance in sampled stops out of a motion, its pair, and when the stop begins [s]."""
     capsules = CapsuleModel(model)
     nearest = Nearest(float("inf"), None, 0.0)
@@ -163,7 +163,7 @@ def motion_stop_clearance(path: Path, limits: MotionLimits, model: ArmModel) -> 
     return nearest
 
 
-def motion_stop_contact(path: Path, limits: MotionLimits, model: ArmModel) -> str | None:
+def motion_stop_contact(path: MotionPath, limits: MotionLimits, model: ArmModel) -> str | None:
     """Describe the sampled stop out of a motion in which capsules around bodies overlap most; None if none touch."""
     nearest = motion_stop_clearance(path, limits, model)
     if nearest.distance > 0.0:
@@ -171,7 +171,7 @@ def motion_stop_contact(path: Path, limits: MotionLimits, model: ArmModel) -> st
     return _touches("motion", nearest.time, nearest.pair, nearest.distance)
 
 
-def require_clear(model: ArmModel, path: Path, trajectories: Sequence[Reference], limits: MotionLimits) -> None:
+def require_clear(model: ArmModel, path: MotionPath, trajectories: Sequence[Reference], limits: MotionLimits) -> None:
     """Raise MotionRefused unless motion and trajectories provably keep clear and no sampled stop out of them touches.
 
     Args:

@@ -32,7 +32,7 @@ import numpy as np
 
 from ident_service.config.motion_limits import MotionLimits, Vector
 from ident_service.errors import MotionRefused
-from ident_service.excitation.trajectory import Path
+from ident_service.excitation.trajectory import MotionPath
 from ident_service.motion.trajectory import Setpoint
 
 Piece = tuple[Vector, Vector]
@@ -118,7 +118,7 @@ def stop(start: Setpoint, limits: MotionLimits) -> StopProfile:
         return _braked(start, limits, np.where(hard_leaves < quick_leaves, side, 0.0))
 
 
-def stop_extent(path: Path, limits: MotionLimits) -> tuple[Vector, Vector]:
+def stop_extent(path: MotionPath, limits: MotionLimits) -> tuple[Vector, Vector]:
     """Return the lowest and highest positions of a motion and of stops out of it at sampled times [rad or m].
 
     Between two sampled times it may be exceeded slightly; and where stops come so close to a position limit that
@@ -140,7 +140,7 @@ def stop_extent(path: Path, limits: MotionLimits) -> tuple[Vector, Vector]:
     return lowest, highest
 
 
-def require_stops_within_limits(path: Path, limits: MotionLimits, names: tuple[str, ...]) -> None:
+def require_stops_within_limits(path: MotionPath, limits: MotionLimits, names: tuple[str, ...]) -> None:
     """Raise MotionRefused where a stop out of the motion, sampled every 5 ms, would leave a joint's position limits.
 
     Args:
@@ -163,7 +163,7 @@ def require_stops_within_limits(path: Path, limits: MotionLimits, names: tuple[s
         raise MotionRefused("a stop out of the motion would leave the position limits: " + "; ".join(found))
 
 
-def _sampled(path: Path) -> Iterator[Vector]:
+def _sampled(path: MotionPath) -> Iterator[Vector]:
     for begin, end in path.distinct:
         count = 2 + int((end - begin) / _STEP)
         for first in range(0, count, _BLOCK):

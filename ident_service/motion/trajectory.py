@@ -16,7 +16,7 @@ import ruckig
 
 from ident_service.config.motion_limits import MotionLimits, Vector
 from ident_service.errors import MotionRefused
-from ident_service.excitation.trajectory import Path
+from ident_service.excitation.trajectory import MotionPath
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Reference(Protocol):
 class PathReference:
     """Represent a path of the excitation as a reference."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: MotionPath) -> None:
         self._path = path
         self.duration = path.duration
 

@@ -179,7 +179,7 @@ def identify_files(
             set_name=request.set_name,
             custom=custom,
             solver=request.solver,
-            again=request.second_opinion,
+            ask_second_solver=request.second_opinion,
             step=lambda words, share: step(words, 0.2 + share * (estimated - 0.2)),
             torque_constants=request.torque_constants,
         )

@@ -17,10 +17,10 @@ from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import Stopped, UsageError, plain_mistake
 from ident_service.estimation.equations import equations
 from ident_service.excitation.described_motion import excitation
-from ident_service.excitation.design import Designed, complete_task, design_motion, family
+from ident_service.excitation.design import Designed, complete_task, design_motion, motion_family
 from ident_service.excitation.motion_file import Excitation, read_excitation
 from ident_service.excitation.prediction import NoiseModel, described_noise
-from ident_service.excitation.search import Budget, Progress, found_to_json, read_found
+from ident_service.excitation.search import Budget, Progress, read_search, search_to_json
 from ident_service.excitation.trajectory import FourierPath
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import BaseParameters
@@ -167,20 +167,20 @@ def design_files(
     if request.length is not None:
         design = _of_length(design, request.length, frozenset(request.changes))
     noise = known_noise(model, request.knowledge)
-    basis, base = family(design, model)
+    basis, base = motion_family(design, model)
     limits = motion_limits(model.config)
     whitening = np.ones_like(noise.deviation) if design.criterion == "condition_number" else noise.deviation
     added = known_information(model, base, request.knowledge, whitening)
     task = complete_task(model, design, basis, base, noise.deviation, added)
-    earlier = None if request.resume is None else read_found(request.resume, task, request.seed)
+    earlier = None if request.resume is None else read_search(request.resume, task, request.seed)
     designed = design_motion(
         model,
         design,
         seed=request.seed,
         budget=request.budget,
         noise=noise.deviation,
-        added=added,
-        earlier=earlier,
+        earlier_information=added,
+        earlier_search=earlier,
         veto=lambda path: motion_stop_contact(path, limits, model),
         stable=lambda kp, kd: stability(model, replace(limits, kp=kp, kd=kd), delay_of(model.config)).stable,
         tell=tell,
@@ -191,7 +191,7 @@ def design_files(
         raise Stopped("interrupted before a first motion was found; nothing is written")
     with atomic_folder(folder) as staging:
         write_atomically(staging / MOTION, designed.excitation.to_json() + "\n")
-        write_atomically(staging / SEARCH, found_to_json(designed.found, task) + "\n")
+        write_atomically(staging / SEARCH, search_to_json(designed.found, task) + "\n")
         write_preview(staging, seen)
     return designed, seen
 

@@ -303,7 +303,7 @@ def require_target(target: Target, model: ArmModel) -> None:
     """
     if not 0.0 < target.share < 1.0:
         raise UsageError(f"a target of {target.share:g} of a parameter; it must be above 0 and below 1")
-    target.places(base_parameters(model.chain, model.layout), model.config.name)
+    target.base_indices(base_parameters(model.chain, model.layout), model.config.name)
 
 
 def least_seconds(motion: Excitation, speed: float) -> float:

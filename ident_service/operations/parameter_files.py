@@ -194,7 +194,7 @@ def _read(
         if claimed["joints"] != joints:
             raise ParameterError(f"{path}: is about the arm {claimed['name']} with other joints than {config.name}")
     claimed_set: FeasibleSetName = "inertia" if file.feasible_set == "inertia" else "pseudo_inertia"
-    conditions = feasible_set(kind or claimed_set, file.base.names, config, positive=Constraints().positive)
+    conditions = feasible_set(kind or claimed_set, file.base.names, config, positive_terms=Constraints().positive)
     custom = () if config is None or config.constraints.custom is None else (custom_note(config.constraints.custom),)
     return file, conditions, (*file.notes, *custom), layout
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from ident_service.config.load import arm_from_json
 from ident_service.estimation.online import SequentialLeastSquares
-from ident_service.estimation.target import LEAST_BLOCKS, Target, worst_share
+from ident_service.estimation.target import LEAST_BLOCKS, Target, worst_relative_deviation
 from ident_service.estimation.uncertainty import relative_deviations
 from ident_service.model.arm_model import arm_model
 from ident_service.recordings.mcap_follower import RecordingFollower
@@ -50,7 +50,7 @@ def watch(folder: Path, target: Target, least_seconds: float) -> dict[str, Any] 
     """
     model = arm_model(arm_from_json(folder / "arm.json"))
     growing = SequentialLeastSquares(model, in_blocks=True, period=least_seconds)
-    places = target.places(growing.base, model.config.name)
+    places = target.base_indices(growing.base, model.config.name)
     if (tail := _opened(folder)) is None:
         return None
     row = 0
@@ -63,7 +63,7 @@ def watch(folder: Path, target: Target, least_seconds: float) -> dict[str, Any] 
         if not growing.step() or tail.exciting_ns is None or (doubt := growing.uncertainty()) is None:
             continue
         seconds = (doubt.until_ns - tail.exciting_ns) * 1e-9
-        worst = worst_share(doubt, places)
+        worst = worst_relative_deviation(doubt, places)
         row = row + 1 if seconds >= least_seconds and worst <= target.share else 0
         if row >= _IN_A_ROW:
             return {"seconds": round(seconds, 3), "share": worst}
@@ -89,7 +89,7 @@ def missed(folder: Path, target: Target, period: float) -> list[dict[str, Any]]:
         growing.add(block)
         while growing.step():
             pass
-    places, doubt = target.places(growing.base, model.config.name), growing.uncertainty()
+    places, doubt = target.base_indices(growing.base, model.config.name), growing.uncertainty()
     if doubt is None or doubt.blocks < LEAST_BLOCKS:
         known = np.full(len(places), np.inf)
     else:

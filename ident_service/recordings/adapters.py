@@ -125,20 +125,20 @@ def driver_of(recording: Recording) -> str:
     return "" if whole is None else driver_of(whole)
 
 
-def overlap(one: Recording, other: Recording) -> bool:
+def overlap(first: Recording, second: Recording) -> bool:
     """Return whether two recordings are of the same file (by hash) and their time ranges overlap."""
-    (start, end), (other_start, other_end) = time_range(one), time_range(other)
-    return one.sha256 == other.sha256 and start < other_end and other_start < end
+    (start, end), (other_start, other_end) = time_range(first), time_range(second)
+    return first.sha256 == second.sha256 and start < other_end and other_start < end
 
 
-def without_standstill(recording: Recording, margin: float) -> RangeRecording:
-    """Return a range without standstill before the first and after the last motion, but `margin`; raises if none moves.
+def without_standstill(recording: Recording, kept_seconds: float) -> RangeRecording:
+    """Return a range without standstill at both ends but for `kept_seconds`; raises if no joint moves.
 
     A joint moves where its mean position over 0.1 s changes by more than 0.005 rad/s or m/s to the next 0.1 s.
 
     Args:
         recording: recording that is read through once.
-        margin: standstill that is kept at both ends [s].
+        kept_seconds: standstill that is kept at both ends [s].
 
     Raises:
         RecordingError: no joint moves; and whatever reading the blocks raises.
@@ -167,30 +167,31 @@ def without_standstill(recording: Recording, margin: float) -> RangeRecording:
     if not len(moving):
         raise RecordingError(recording.path, f"no joint moves faster than {STANDSTILL:g} rad/s or m/s")
     begins, ends = (first_ns - file_ns) * 1e-9, (last_ns - file_ns) * 1e-9
-    start = bins[moving[0]] * _BIN - margin
-    end = (bins[moving[-1] + 1] + 1) * _BIN + margin
+    start = bins[moving[0]] * _BIN - kept_seconds
+    end = (bins[moving[-1] + 1] + 1) * _BIN + kept_seconds
     part = RangeRecording(recording, start, end)
     part.standstill = (max(start - begins, 0.0), max(ends - end, 0.0))
     return part
 
 
-def without_ends(recording: Recording, trim: tuple[float, float]) -> RangeRecording:
+def without_ends(recording: Recording, trim_seconds: tuple[float, float]) -> RangeRecording:
     """Return the recording without its first `trim[0]` and last `trim[1]` seconds; RecordingError if nothing is left.
 
     Args:
         recording: recording that is read through once.
-        trim: seconds to leave out at the start and at the end [s].
+        trim_seconds: seconds to leave out at the start and at the end [s].
 
     Raises:
         RecordingError: nothing would be left; and whatever reading the blocks raises.
     """
     stamps = [(int(block.stamp_ns[0]), int(block.stamp_ns[-1])) for block in recording.blocks()]
     file_ns, begins, ends = first_stamp(recording), stamps[0][0], stamps[-1][1]
-    start, end = begins + round(trim[0] * 1e9), ends - round(trim[1] * 1e9)
+    start, end = begins + round(trim_seconds[0] * 1e9), ends - round(trim_seconds[1] * 1e9)
     if start > end:
         raise RecordingError(
             recording.path,
-            f"nothing is left after trimming {trim[0]:g} s and {trim[1]:g} s of {(ends - begins) * 1e-9:.6g} s",
+            f"nothing is left after trimming {trim_seconds[0]:g} s and {trim_seconds[1]:g} s "
+            f"of {(ends - begins) * 1e-9:.6g} s",
         )
     part = RangeRecording(recording, (start - file_ns) * 1e-9, (end + 1 - file_ns) * 1e-9)  # the last sample included
     part.standstill = recording.standstill if isinstance(recording, RangeRecording) else part.standstill

@@ -257,7 +257,7 @@ class CsvRecording:
             samples,
             self.path,
             names,
-            place=lambda index: f"line {index + _FIRST_ROW}",
+            sample_words=lambda index: f"line {index + _FIRST_ROW}",
             skip_missing=self._skip_missing,
         )
 

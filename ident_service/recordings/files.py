@@ -17,20 +17,20 @@ _STEP: Final = 1 << 20
 _RANGE: Final = re.compile(r"^(?P<path>.+)@(?P<start>\d+(?:\.\d*)?)?:(?P<end>\d+(?:\.\d*)?)?$")
 
 
-def split_range(path: str) -> tuple[str, tuple[float, float] | None]:
+def split_range(path_and_range: str) -> tuple[str, tuple[float, float] | None]:
     """Split `FILE@START:END` into the path and (start, end) [s], None without a range; no file is looked at.
 
     Raises:
         UsageError: the range ends before it begins.
     """
-    match = _RANGE.match(path)
+    match = _RANGE.match(path_and_range)
     if match is None:
-        return path, None
+        return path_and_range, None
     start, end = float(match["start"] or 0.0), float(match["end"] or math.inf)
     if not start < end:
         raise UsageError(
-            f"{path}: a range ends after it begins; FILE@START:END are the seconds of the recording that are read (to "
-            "leave out seconds at the ends: recording.trim)"
+            f"{path_and_range}: a range ends after it begins; FILE@START:END are the seconds of the recording that are "
+            "read (to leave out seconds at the ends: recording.trim)"
         )
     return match["path"], (start, end)
 
@@ -64,8 +64,8 @@ def require_writable(folder: Path) -> None:
         raise UsageError(f"{folder}: cannot be written: {error.strerror}") from None
 
 
-def sha256(path: Path, size: int) -> str:
-    """Return the SHA-256 (hex) of a file's first `size` bytes, so that a growing file can be hashed.
+def sha256(path: Path, first_bytes: int) -> str:
+    """Return the SHA-256 (hex) of a file's beginning, `first_bytes` long, so that a growing file can be hashed.
 
     Raises:
         RecordingError: the file cannot be read.
@@ -73,9 +73,9 @@ def sha256(path: Path, size: int) -> str:
     digest = hashlib.sha256()
     try:
         with path.open("rb") as stream:
-            while size > 0 and (data := stream.read(min(_STEP, size))):
+            while first_bytes > 0 and (data := stream.read(min(_STEP, first_bytes))):
                 digest.update(data)
-                size -= len(data)
+                first_bytes -= len(data)
     except OSError as error:
         raise RecordingError(path, f"cannot be read: {error.strerror}") from error
     return digest.hexdigest()

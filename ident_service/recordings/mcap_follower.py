@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ident_service.errors import RecordingError
 from ident_service.recordings import mcap_records as mcap
-from ident_service.recordings.mcap_reader import Event, Layout, PayloadError, event
+from ident_service.recordings.mcap_reader import Event, Layout, PayloadError, decode_event
 from ident_service.recordings.recording import Matrix, Stamps
 
 MOST_BYTES: Final = 1 << 20
@@ -72,10 +72,10 @@ class RecordingFollower:
         self.exciting_ns: int | None = None
         self.events: list[Event] = []
 
-    def read(self, most: int = MOST_BYTES) -> Samples | None:
+    def read(self, most_bytes: int = MOST_BYTES) -> Samples | None:
         """Return the next samples that the recorder has flushed, each once; None while there are no new ones.
 
-        At most `most` bytes of the file are read at a time, or one record.
+        At most `most_bytes` bytes of the file are read at a time, or one record.
 
         Raises:
             RecordingError: the file is damaged, or no recording of this package.
@@ -86,7 +86,7 @@ class RecordingFollower:
         torques: list[bytes] = []
         while not stamps and not self.ended:
             try:
-                records = self._records(os.pread(self._stream.fileno(), most, self._position))
+                records = self._records(os.pread(self._stream.fileno(), most_bytes, self._position))
             except OSError as error:
                 raise RecordingError(self._path, f"cannot be read: {error.strerror}") from None
             if not records:
@@ -156,7 +156,7 @@ class RecordingFollower:
                 elif topic == _TORQUES:
                     torques.append(payload)
                 elif topic == _EVENTS and len(self.events) < MOST_EVENTS:
-                    self.events.append(event(payload, 0))
+                    self.events.append(decode_event(payload, 0))
                     if self.exciting_ns is None and self.events[-1].message == _EXCITING:
                         self.exciting_ns = stamp
         except (mcap.TornError, mcap.TooLargeError, struct.error) as error:

@@ -121,15 +121,15 @@ class Layout:
         where = np.concatenate(fixed)
         return cls(tuple(names), **starts, fixed=where, expected=np.frombuffer(payload, np.uint8)[where])
 
-    def matches(self, rows: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    def matches(self, payload_rows: NDArray[np.uint8]) -> NDArray[np.bool_]:
         """Return a mask of the payloads, one a row of bytes, that have this layout."""
-        same: NDArray[np.bool_] = (rows[:, self.fixed] == self.expected).all(axis=1)
+        same: NDArray[np.bool_] = (payload_rows[:, self.fixed] == self.expected).all(axis=1)
         return same
 
-    def columns(self, rows: NDArray[np.uint8], start: int, order: NDArray[np.intp]) -> Matrix:
-        """Return the float64 sequence at byte `start` of all payloads, reordered, shape (payloads, len(order))."""
-        values = rows[:, start : start + 8 * len(self.names)]
-        return np.ascontiguousarray(values).view("<f8")[:, order].astype(np.float64, copy=False)
+    def columns(self, payload_rows: NDArray[np.uint8], start_byte: int, joint_order: NDArray[np.intp]) -> Matrix:
+        """Return the float64 sequence at `start_byte` of all payloads, in `joint_order`, shape (payloads, joints)."""
+        values = payload_rows[:, start_byte : start_byte + 8 * len(self.names)]
+        return np.ascontiguousarray(values).view("<f8")[:, joint_order].astype(np.float64, copy=False)
 
 
 class JointStateDecoder:
@@ -320,7 +320,7 @@ def read_extras(
         for run in mcap.contents(stream, size) if runs is None else runs:
             for channel_id, _, payload in mcap.messages(run, directory, lambda channel_id: bool(kind(channel_id))):
                 if kind(channel_id) == _EVENTS:
-                    events.append(event(payload, utc_offset_ns))
+                    events.append(decode_event(payload, utc_offset_ns))
                 else:
                     description = _string(payload, 4)[0]
     except mcap.TornError:
@@ -330,7 +330,7 @@ def read_extras(
     return Extras(metadata, attachments, tuple(events), description)
 
 
-def event(payload: bytes, utc_offset_ns: int) -> Event:
+def decode_event(payload: bytes, utc_offset_ns: int) -> Event:
     """Decode a message of `/events`, its stamp less `utc_offset_ns` [ns]; raises struct.error if malformed."""
     seconds, nanoseconds, level = struct.unpack_from("<iIB", payload, 4)
     name, position = _string(payload, _LOG_TEXTS)
@@ -705,7 +705,7 @@ class McapRecording:
         try:
             for opcode, content in mcap.records(stream, self._size, {*mcap.CONTENTS, Opcode.METADATA}):
                 if opcode != Opcode.METADATA:
-                    run = mcap.run_of(opcode, content)
+                    run = mcap.expanded_records(opcode, content)
                     kept += len(run)
                     if kept > _KEPT:
                         runs.clear()

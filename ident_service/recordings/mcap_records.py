@@ -73,17 +73,19 @@ class Period(NamedTuple):
     wanted: tuple[int, ...]
 
     @classmethod
-    def of(cls, run: bytes, begins: Sequence[int], end: int, wanted: Sequence[int]) -> Period:
-        """Build the repeating pattern of messages at the offsets `begins` in a run of bytes, up to `end`."""
-        start, length = begins[0], end - begins[0]
-        where = np.add.outer(np.array(begins) - start, np.arange(_MESSAGE_HEAD.size)).ravel()
-        expected = np.frombuffer(run, np.uint8, length, start)[where]
-        return cls(length, where, expected, tuple(at - start for at in wanted))
+    def of(cls, record_bytes: bytes, message_offsets: Sequence[int], end: int, wanted_offsets: Sequence[int]) -> Period:
+        """Build the repeating pattern of messages at the offsets `message_offsets` in a run of bytes, up to `end`."""
+        start, length = message_offsets[0], end - message_offsets[0]
+        where = np.add.outer(np.array(message_offsets) - start, np.arange(_MESSAGE_HEAD.size)).ravel()
+        expected = np.frombuffer(record_bytes, np.uint8, length, start)[where]
+        return cls(length, where, expected, tuple(at - start for at in wanted_offsets))
 
-    def repeats(self, run: bytes, position: int) -> int:
-        """Return how often in a row the pattern stands in `run` from `position` on."""
+    def repeats(self, record_bytes: bytes, position: int) -> int:
+        """Return how often in a row the pattern stands in `record_bytes` from `position` on."""
         length = self.length
-        rows = np.frombuffer(run, np.uint8, (len(run) - position) // length * length, position).reshape(-1, length)
+        rows = np.frombuffer(
+            record_bytes, np.uint8, (len(record_bytes) - position) // length * length, position
+        ).reshape(-1, length)
         same = (rows[:, self.where] == self.expected).all(axis=1)
         return len(rows) if same.all() else int(np.argmin(same))
 
@@ -102,13 +104,13 @@ class Directory:
         return self.schemas.get(channel.schema_id, "")
 
 
-def records(stream: IO[bytes], size: int, wanted: Collection[int]) -> Iterator[tuple[int, bytes]]:
+def records(stream: IO[bytes], size: int, wanted_opcodes: Collection[int]) -> Iterator[tuple[int, bytes]]:
     """Yield (opcode, content) of the wanted records of a file in order; raises TornError at the first damage.
 
     Args:
         stream: the file, from its first byte on.
         size: how many of its bytes to read at most.
-        wanted: opcodes to read; the others are stepped over.
+        wanted_opcodes: opcodes to read; the others are stepped over.
 
     Raises:
         TornError: the bytes end before the closing magic, or cannot be records.
@@ -129,7 +131,7 @@ def records(stream: IO[bytes], size: int, wanted: Collection[int]) -> Iterator[t
             if position + len(MAGIC) > size or stream.read(len(MAGIC)) != MAGIC:
                 raise TornError("the file ends within its end mark")
             return
-        if opcode not in wanted:
+        if opcode not in wanted_opcodes:
             stream.seek(position)
             continue
         if length > MAX_RECORD:
@@ -148,10 +150,10 @@ def contents(stream: IO[bytes], size: int) -> Iterator[bytes]:
         TooLargeError: as `records`, or a chunk that expands beyond 64 MiB.
     """
     for opcode, content in records(stream, size, CONTENTS):
-        yield run_of(opcode, content)
+        yield expanded_records(opcode, content)
 
 
-def run_of(opcode: int, content: bytes) -> bytes:
+def expanded_records(opcode: int, content: bytes) -> bytes:
     """Return the bytes of the records in a chunk, expanded; of any other record, that record itself."""
     return expand(content) if opcode == Opcode.CHUNK else _HEAD.pack(opcode, len(content)) + content
 
@@ -185,9 +187,11 @@ def expand(content: bytes) -> bytes:
     return bytes(data)
 
 
-def messages(run: bytes, directory: Directory, choose: Callable[[int], bool] = lambda _: True) -> Iterator[Message]:
+def messages(
+    record_bytes: bytes, directory: Directory, choose_channel: Callable[[int], bool] = lambda _: True
+) -> Iterator[Message]:
     """Yield channel id, log time [ns] and payload of each message of chosen channels in bytes of records."""
-    for found in series(run, directory, choose):
+    for found in series(record_bytes, directory, choose_channel):
         if isinstance(found, Series):
             for stamp, row in zip(found.log_times.tolist(), found.payloads, strict=True):
                 yield found.channel, stamp, row.tobytes()
@@ -196,16 +200,16 @@ def messages(run: bytes, directory: Directory, choose: Callable[[int], bool] = l
 
 
 def series(
-    run: bytes, directory: Directory, choose: Callable[[int], bool] = lambda _: True
+    record_bytes: bytes, directory: Directory, choose_channel: Callable[[int], bool] = lambda _: True
 ) -> Iterator[Message | Series]:
     """Yield the messages of chosen channels in bytes of records, like ones as a `Series`; fill in `directory`.
 
     Where records repeat in kind, length and channel, as those of a loop do, all of them are found at once.
 
     Args:
-        run: run of records.
+        record_bytes: run of records.
         directory: directory of the file so far.
-        choose: function that says which channels to read, called at each one's first message.
+        choose_channel: function that says which channels to read, called at each one's first message.
 
     Yields:
         Channel id, log time [ns] and payload; or several of one channel at once.
@@ -215,11 +219,11 @@ def series(
     """
     from mcap.records import Channel, Schema
 
-    position, end, chosen = 0, len(run), directory.chosen
+    position, end, chosen = 0, len(record_bytes), directory.chosen
     if (known := directory.period) is not None and end % known.length == 0 < end:
         count = end // known.length
-        if known.repeats(run, 0) == count:
-            yield from (_gathered(run, offset, 0, known.length, count) for offset in known.wanted)
+        if known.repeats(record_bytes, 0) == count:
+            yield from (_gathered(record_bytes, offset, 0, known.length, count) for offset in known.wanted)
             return
     head, unpack = _HEAD.size, _MESSAGE_HEAD.unpack_from  # three messages a cycle: what is looked up here counts
     # The head of the message that a period may begin with, and where its messages begin.
@@ -227,47 +231,47 @@ def series(
     begins: list[int] = []
     try:
         while position < end:
-            if run[position] == _A_MESSAGE:
-                if regular and run[position : position + _MESSAGE_HEAD.size] == first:
+            if record_bytes[position] == _A_MESSAGE:
+                if regular and record_bytes[position : position + _MESSAGE_HEAD.size] == first:
                     last, begins = begins, []
-                    slots = [at for at in last if chosen[unpack(run, at)[2]]]
-                    period = Period.of(run, last, position, slots)
-                    count = period.repeats(run, position) if len(slots) < 2 else 0
+                    slots = [at for at in last if chosen[unpack(record_bytes, at)[2]]]
+                    period = Period.of(record_bytes, last, position, slots)
+                    count = period.repeats(record_bytes, position) if len(slots) < 2 else 0
                     regular = count >= _FEW
                     first = b""
                     if regular:
                         directory.period = period
                     if slots and count:
-                        yield _gathered(run, slots[0] - last[0], position, period.length, count)
+                        yield _gathered(record_bytes, slots[0] - last[0], position, period.length, count)
                     position += count * period.length
                     if count:
                         continue
-                _, length, channel = unpack(run, position)
+                _, length, channel = unpack(record_bytes, position)
                 begin = position
                 position += head + length
                 if length < _MESSAGE_FIELDS or position > end:
                     raise TornError("a chunk ends within a message")
                 if (wanted := chosen.get(channel)) is None:
-                    wanted = chosen[channel] = choose(channel)
+                    wanted = chosen[channel] = choose_channel(channel)
                 if regular:
                     if not first or len(begins) == _LONGEST:
-                        first, begins = run[begin : begin + _MESSAGE_HEAD.size], []
+                        first, begins = record_bytes[begin : begin + _MESSAGE_HEAD.size], []
                     begins.append(begin)
                 if wanted:
-                    log_time = _MESSAGE.unpack_from(run, begin)[4]
-                    yield channel, log_time, run[begin + _MESSAGE.size : position]
+                    log_time = _MESSAGE.unpack_from(record_bytes, begin)[4]
+                    yield channel, log_time, record_bytes[begin + _MESSAGE.size : position]
                 continue
-            opcode, length = _HEAD.unpack_from(run, position)
+            opcode, length = _HEAD.unpack_from(record_bytes, position)
             start = position + _HEAD.size
             position = start + length
             if position > end:
                 raise TornError("a chunk ends within a record")
             first, begins = b"", []
             if opcode == Opcode.CHANNEL:
-                found: Channel = _parse(Channel, run[start:position])
+                found: Channel = _parse(Channel, record_bytes[start:position])
                 directory.channels[found.id] = found
             elif opcode == Opcode.SCHEMA:
-                schema: Schema = _parse(Schema, run[start:position])
+                schema: Schema = _parse(Schema, record_bytes[start:position])
                 directory.schemas[schema.id] = schema.name
     except struct.error as error:
         raise TornError("a chunk ends within a record") from error

@@ -183,12 +183,12 @@ def encode_string(data: str) -> bytes:
     return builder.payload()
 
 
-def encode_log(utc_ns: int, level: int, name: str, message: str) -> bytes:
+def encode_log(utc_ns: int, level: int, logger_name: str, message: str) -> bytes:
     """Return the payload of a rcl_interfaces/msg/Log; `level` is 10 (debug), 20, 30, 40 or 50 (fatal)."""
     builder = CdrBuilder()
     builder.stamp(utc_ns)
     builder.uint8(level)
-    for text in (name, message, "", ""):
+    for text in (logger_name, message, "", ""):
         builder.string(text)
     builder.uint32(0)
     return builder.payload()

@@ -136,10 +136,10 @@ class RingConsumer:
         reader = self._reader
         while (record := reader.read()) is not None:
             self._write(record)
-            reader.taken()
+            reader.publish_cursor()
             reader.beat()
         # Lost records are dealt with too, and a sink may be waiting for nothing else.
-        reader.taken()
+        reader.publish_cursor()
         if self._room is not None:
             os.eventfd_write(self._room, 1)
 
@@ -185,7 +185,7 @@ class RingConsumer:
             os.eventfd_write(self._room, 1)
 
 
-def serve(channel: socket.socket, ring: int, work: int, room: int) -> None:
+def serve(channel: socket.socket, ring_fd: int, work_fd: int, room_fd: int) -> None:
     """Record the ring into the file that the request on `channel` names; answer there, with a report at its end."""
     with channel.makefile("rb") as lines:
 
@@ -201,7 +201,7 @@ def serve(channel: socket.socket, ring: int, work: int, room: int) -> None:
             return  # the parent was killed, perhaps in the middle of its request
         asked: dict[str, Any] = json.loads(line)
         attachments = {name: base64.b64decode(data) for name, data in asked["attachments"].items()}
-        with RingReader(ring, recorder=True) as reader:
+        with RingReader(ring_fd, recorder=True) as reader:
             writer = RecordingWriter(
                 asked["path"],
                 asked["joint_names"],
@@ -218,7 +218,11 @@ def serve(channel: socket.socket, ring: int, work: int, room: int) -> None:
                 return
             tell({"ready": True})
             tell(
-                asdict(RingConsumer(reader, writer, channel.fileno(), work, room if asked["lock_step"] else None).run())
+                asdict(
+                    RingConsumer(
+                        reader, writer, channel.fileno(), work_fd, room_fd if asked["lock_step"] else None
+                    ).run()
+                )
             )
 
 

@@ -99,7 +99,7 @@ class Recording(Protocol):
     torn: bool
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
-        """Yield the samples in order, in blocks of `samples` (the last is shorter); raises RecordingError.
+        """Yield samples in blocks of `samples` (the last is shorter); RecordingError for NaN or stamps that run back.
 
         Raises:
             RecordingError: NaN or infinite values, stamps that run backwards or repeat with other values, a torn row
@@ -112,7 +112,7 @@ def assemble(
     samples: int,
     path: Path,
     joints: Sequence[str],
-    place: Callable[[int], str] = "sample {}".format,
+    sample_words: Callable[[int], str] = "sample {}".format,
     *,
     skip_missing: bool = False,
 ) -> Iterator[Block]:
@@ -123,7 +123,7 @@ def assemble(
         samples: length of the blocks; the last one is shorter.
         path: of the file, for messages.
         joints: a name per column, for messages.
-        place: name in messages of the sample of this index (from 0, those left out counted).
+        sample_words: name in messages of the sample of this index (from 0, those left out counted).
         skip_missing: whether to leave out samples with a value of NaN.
 
     Raises:
@@ -133,7 +133,7 @@ def assemble(
     """
     if samples < 1:
         raise UsageError(f"{samples=} but a block has at least one sample")
-    check = _Check(path, joints, place, skip_missing=skip_missing)
+    check = _Check(path, joints, sample_words, skip_missing=skip_missing)
     waiting: list[Block] = []
     count = 0
     for piece in pieces:

@@ -206,14 +206,14 @@ def _grid(recording: Recording, fmt: RecordingFormat) -> Grid:
     )
 
 
-def trimmed(blocks: Iterable[Block], trim: tuple[float, float]) -> Iterator[Block]:
-    """Yield blocks without the first and the last seconds of `trim`, cutting those at the borders.
+def trimmed(blocks: Iterable[Block], trim_seconds: tuple[float, float]) -> Iterator[Block]:
+    """Yield blocks without the first and the last seconds of `trim_seconds`, cutting those at the borders.
 
     Args:
         blocks: blocks of a recording, in order.
-        trim: seconds to leave out at the start and at the end [s].
+        trim_seconds: seconds to leave out at the start and at the end [s].
     """
-    at_start, at_end = (round(seconds * 1e9) for seconds in trim)
+    at_start, at_end = (round(seconds * 1e9) for seconds in trim_seconds)
     waiting: deque[Block] = deque()
     first_ns: int | None = None
     end_ns = 0
@@ -324,7 +324,7 @@ class UniformRun:
 def uniform(
     recording: Recording,
     fmt: RecordingFormat,
-    known: Grid | None = None,
+    known_grid: Grid | None = None,
     *,
     shortest_s: float = 0.0,
     samples: int = BLOCK_SAMPLES,
@@ -339,14 +339,14 @@ def uniform(
     Args:
         recording: to be read.
         fmt: seconds to trim, length of a gap, and the rate.
-        known: result of `grid(recording, fmt)`, where that has been found already.
+        known_grid: result of `grid(recording, fmt)`, where that has been found already.
         shortest_s: least duration of the segments that are read [s]; more where resampling needs it (`Grid.least_s`).
         samples: how many samples to read at a time.
 
     Raises:
         RecordingError: no segment is long enough, and whatever `grid` and the recording's blocks raise.
     """
-    stamps = known or grid(recording, fmt)
+    stamps = known_grid or grid(recording, fmt)
     least = stamps.least_s(shortest_s)
     longest = max(segment.duration_s for segment in stamps.segments)
     if longest < least:

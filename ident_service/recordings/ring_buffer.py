@@ -130,12 +130,12 @@ class State(enum.IntEnum):
     ENDED = 3
 
 
-def create_memory(joints: int, slots: int, slot_bytes: int) -> int:
+def create_memory(joint_count: int, slot_count: int, slot_bytes: int) -> int:
     """Create a ring's shared memory, allocated and empty; return its file descriptor, for the caller to close.
 
     Args:
-        joints: number of joints in every record, 1 to 64.
-        slots: number of records that fit, 4 to 2**20.
+        joint_count: number of joints in every record, 1 to 64.
+        slot_count: number of records that fit, 4 to 2**20.
         slot_bytes: size of one slot [bytes].
 
     Returns:
@@ -145,12 +145,13 @@ def create_memory(joints: int, slots: int, slot_bytes: int) -> int:
         UsageError: a count beyond its bounds.
         OSError: not enough memory.
     """
-    if not (1 <= joints <= MAX_JOINTS and LEAST_SLOTS <= slots <= MAX_SLOTS):
+    if not (1 <= joint_count <= MAX_JOINTS and LEAST_SLOTS <= slot_count <= MAX_SLOTS):
         raise UsageError(
-            f"{joints=}, {slots=} but a ring has 1 to {MAX_JOINTS} joints and {LEAST_SLOTS} to {MAX_SLOTS} slots"
+            f"joints={joint_count}, slots={slot_count} but a ring has 1 to {MAX_JOINTS} joints "
+            f"and {LEAST_SLOTS} to {MAX_SLOTS} slots"
         )
-    size = HEADER_BYTES + slots * slot_bytes
-    fixed = _FIXED.pack(_MAGIC, _VERSION, joints, slots, slot_bytes, size)
+    size = HEADER_BYTES + slot_count * slot_bytes
+    fixed = _FIXED.pack(_MAGIC, _VERSION, joint_count, slot_count, slot_bytes, size)
     fd = os.memfd_create("ident-ring", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
     try:
         # Memory that is only promised would be missed as a bus error in the middle of a motion.
@@ -207,9 +208,9 @@ class RingMemory:
         self._bytes = memoryview(self.content)
         self.words = self._bytes.cast("Q")
 
-    def slot_word_index(self, number: int) -> int:
-        """Return the index of the 8-byte word that the slot of record `number` begins with."""
-        return (HEADER_BYTES + number % self.slots * self.slot_bytes) >> 3
+    def slot_word_index(self, record_number: int) -> int:
+        """Return the index of the 8-byte word that the slot of record `record_number` begins with."""
+        return (HEADER_BYTES + record_number % self.slots * self.slot_bytes) >> 3
 
     def set_text(self, text: str) -> None:
         """Store the reason of a failure in the ring, cut to fit; the state that announces it is set later."""
@@ -259,40 +260,40 @@ class EventRecord(NamedTuple):
 Record = Cycle | EventRecord
 
 
-def cycle_bytes(joints: int) -> int:
+def cycle_bytes(joint_count: int) -> int:
     """Return the size of a cycle's content in a slot, behind the checksum [bytes]."""
-    return AT_VECTORS - BODY + 8 * (VECTORS + 1) * joints + joints
+    return AT_VECTORS - BODY + 8 * (VECTORS + 1) * joint_count + joint_count
 
 
-def slot_bytes(joints: int) -> int:
+def slot_bytes(joint_count: int) -> int:
     """Return the size of a slot [bytes] for so many joints, a multiple of 64 (cache lines)."""
-    return max(_LEAST_BYTES, -(-(8 + BODY + cycle_bytes(joints)) // 64) * 64)
+    return max(_LEAST_BYTES, -(-(8 + BODY + cycle_bytes(joint_count)) // 64) * 64)
 
 
-def message_bytes(message: str, room: int) -> bytes:
-    """Return a message in UTF-8, cut at a whole character and ending in `[cut]` where longer than `room` [bytes]."""
+def message_bytes(message: str, most_bytes: int) -> bytes:
+    """Return a message in UTF-8, cut at a whole character and ending in `[cut]` where longer than `most_bytes`."""
     data = message.encode("utf-8", "backslashreplace")
-    if len(data) <= room:
+    if len(data) <= most_bytes:
         return data
-    return data[: room - len(_CUT)].decode("utf-8", "ignore").encode() + _CUT
+    return data[: most_bytes - len(_CUT)].decode("utf-8", "ignore").encode() + _CUT
 
 
-def decode(content: bytes, number: int, joints: int) -> Record | None:
-    """Return the cycle or event in a slot's content; None unless it is record `number` and its checksum fits."""
+def decode(content: bytes, record_number: int, joint_count: int) -> Record | None:
+    """Return the cycle or event in a slot's content; None unless it is record `record_number` and its checksum fits."""
     checksum, length = CHECK.unpack_from(content)
     if not HEAD.size <= length <= len(content) - BODY or zlib.crc32(content[BODY : BODY + length]) != checksum:
         return None
     found, kind, level, stamp_ns = HEAD.unpack_from(content, BODY)
-    if found != number:
+    if found != record_number:
         return None
     if kind == EVENT:
         return EventRecord(stamp_ns, level, content[AT_MESSAGE : BODY + length].decode("utf-8", "replace"))
-    if kind not in (CYCLE, CYCLE_WITH_VELOCITY) or length != cycle_bytes(joints):
+    if kind not in (CYCLE, CYCLE_WITH_VELOCITY) or length != cycle_bytes(joint_count):
         return None
     cycle, lateness_ns, compute_ns, lost = TIMING.unpack_from(content, AT_TIMING)
-    vectors = np.frombuffer(content, np.float64, VECTORS * joints, AT_VECTORS).reshape(VECTORS, joints)
-    age = np.frombuffer(content, np.int64, joints, AT_VECTORS + 8 * VECTORS * joints)
-    valid = np.frombuffer(content, np.bool_, joints, AT_VECTORS + 8 * (VECTORS + 1) * joints)
+    vectors = np.frombuffer(content, np.float64, VECTORS * joint_count, AT_VECTORS).reshape(VECTORS, joint_count)
+    age = np.frombuffer(content, np.int64, joint_count, AT_VECTORS + 8 * VECTORS * joint_count)
+    valid = np.frombuffer(content, np.bool_, joint_count, AT_VECTORS + 8 * (VECTORS + 1) * joint_count)
     velocity = vectors[1] if kind == CYCLE_WITH_VELOCITY else None
     return Cycle(
         *(stamp_ns, vectors[0], velocity, vectors[2], vectors[3], vectors[4]),
@@ -307,9 +308,9 @@ SLOTS: Final = 8192  # eight seconds at 1 kHz; 4 MiB for up to eight joints
 _RETRIES: Final = 16
 
 
-def create_ring(joints: int, slots: int = SLOTS) -> int:
+def create_ring(joint_count: int, slot_count: int = SLOTS) -> int:
     """Create an empty ring; return its file descriptor, for the caller to close."""
-    return create_memory(joints, slots, slot_bytes(joints))
+    return create_memory(joint_count, slot_count, slot_bytes(joint_count))
 
 
 class RingWriter:
@@ -510,7 +511,7 @@ class RingReader:
                         self._skip_to(number + 1)
                         torn = 0
 
-    def taken(self) -> None:
+    def publish_cursor(self) -> None:
         """Publish the recorder's cursor: every record before it has been processed."""
         self._words[CURSOR] = self.cursor
 
@@ -518,11 +519,11 @@ class RingReader:
         """Store the current monotonic time as the recorder's heartbeat."""
         self._words[RECORDER_HEARTBEAT] = time.monotonic_ns()
 
-    def end(self, error: str | None = None) -> None:
-        """Mark, as the recorder, that no more records are taken: ended, or failed with `error` as the reason."""
-        if error is not None:
-            self.memory.set_text(error)
-        self._words[STATE] = State.ENDED if error is None else State.FAILED
+    def end(self, error_text: str | None = None) -> None:
+        """Mark, as the recorder, that no more records are taken: ended, or failed with `error_text` as the reason."""
+        if error_text is not None:
+            self.memory.set_text(error_text)
+        self._words[STATE] = State.ENDED if error_text is None else State.FAILED
 
     def _skip_to(self, number: int) -> None:
         self.lost += number - self.cursor

@@ -15,7 +15,7 @@ from ident_service.config.load import load_arm
 from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import ConfigError
 from ident_service.excitation.described_motion import excitation
-from ident_service.excitation.limit_proof import demands
+from ident_service.excitation.limit_proof import peak_bounds
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import base_parameters
 from ident_service.model.regressor import joint_regressor
@@ -78,7 +78,7 @@ def test_the_torque_of_each_motor_is_proven_and_a_motion_made_smaller_for_it(tmp
         return arm_model(load_arm(simulated_arm(tmp_path, name, motor_torque=limit.tolist()))), limit
 
     weak, _ = of("weak", 0.9)
-    asked = demands(path, weak)
+    asked = peak_bounds(path, weak)
     assert asked.motors is not None
     assert (asked.motors >= motors).all()
     assert (asked.motors <= 1.1 * motors).all()
@@ -86,7 +86,7 @@ def test_the_torque_of_each_motor_is_proven_and_a_motion_made_smaller_for_it(tmp
     assert [line.split(":")[0] for line in said] == ["motor 1", "motor 2"]
     assert all("exceeds" in line for line in said)
     held, limit = of("held", 1.3)
-    smaller = demands(excitation(held, "identification").path, held)
+    smaller = peak_bounds(excitation(held, "identification").path, held)
     assert smaller.motors is not None
     assert (smaller.motors <= 0.7 * limit).all()  # the share that a seeded motion uses
 

@@ -45,7 +45,7 @@ def changed(**by_name: float) -> tuple[np.ndarray, Motion]:
 
 def test_a_motion_says_what_a_difference_does_to_torques() -> None:
     difference, motion = changed(fo2=0.7)
-    np.testing.assert_allclose(motion.change(difference), [0.0, 0.7, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(motion.torque_change(difference), [0.0, 0.7, 0.0, 0.0], atol=1e-9)
     assert motion.residual == pytest.approx(np.full(4, 0.1), rel=0.2)
 
 

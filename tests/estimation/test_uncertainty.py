@@ -12,7 +12,7 @@ from helpers.random_arms import model_around, random_delta
 
 from ident_service.estimation.equations import Equations
 from ident_service.estimation.least_squares import ordinary_least_squares
-from ident_service.estimation.uncertainty import jackknife, negligible, uncertainty, verdicts, widening
+from ident_service.estimation.uncertainty import jackknife, negligible, student_factors, uncertainty, verdicts
 from ident_service.model.base_parameters import base_parameters
 from ident_service.model.chain import Array
 from ident_service.model.information import Information
@@ -129,7 +129,7 @@ def test_degrees_of_freedom_are_those_of_the_variances(blocks: int) -> None:
 
 def test_a_deviation_from_few_blocks_is_wider() -> None:
     table = [1.0, 2.021 / 1.960, 2.776 / 1.960]  # of Student's t
-    np.testing.assert_allclose(widening(np.array([1e6, 40.0, 4.0])), table, rtol=1e-3)
+    np.testing.assert_allclose(student_factors(np.array([1e6, 40.0, 4.0])), table, rtol=1e-3)
 
 
 def repeated(periods: int, error: float, noise: float, seed: int = 3) -> Equations:

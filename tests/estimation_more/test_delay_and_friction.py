@@ -22,7 +22,7 @@ from ident_service.estimation.identify import identify
 from ident_service.estimation.least_squares import torque_error, weighted_least_squares
 from ident_service.estimation.shape_uncertainty import ShapeUncertainty, shape_uncertainty
 from ident_service.estimation.torque_delay import Delay, estimate_delay, with_delay
-from ident_service.estimation.uncertainty import widening
+from ident_service.estimation.uncertainty import student_factors
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import BaseParameters, base_parameters
 from ident_service.model.friction_state import friction_direction
@@ -363,7 +363,7 @@ def test_deviations_of_friction_hold_where_its_shape_was_fitted(noise: float) ->
 def test_degrees_of_freedom_of_both_parts_are_joined() -> None:
     shape = ShapeUncertainty(np.diag([3.0, 0.0, 1.0]), np.array([2.0, np.inf, 5.0]), np.array([8.0, 8.0, 8.0]))
     degrees = np.array([30.0, 5.0, 30.0])
-    deviations, joined = shape.joined(np.array([1.0, 2.0, np.inf]) * widening(degrees), degrees)
+    deviations, joined = shape.joined(np.array([1.0, 2.0, np.inf]) * student_factors(degrees), degrees)
     # Student's t has 97.5 % below 4.302653, 2.306004 and 2.570582 with 2, 8 and 5 degrees of freedom.
     both = np.sqrt(2.306004**2 + 3.0 * 4.302653**2) / 1.959964
     np.testing.assert_allclose(deviations, [both, 2.0 * 2.570582 / 1.959964, np.inf], rtol=1e-6)

@@ -55,7 +55,7 @@ def test_rows_that_the_model_explains_count_in_full_and_others_as_they_deserve()
     # Rows near standstill are also those within 0.1 s of slow ones, whose noise is small.
     assert np.all(shares > 1.0 / 40.0)
     assert np.all(shares < 1.0 / 10.0)
-    weighed, full = gathered.with_near(shares), gathered.with_near(np.ones(2))
+    weighed, full = gathered.with_standstill_rows(shares), gathered.with_standstill_rows(np.ones(2))
     assert off(model, delta, weighed) < 0.2 * off(model, delta, full)
     np.testing.assert_array_equal(weighed.total.rows, gathered.everything.rows)
     assert not weighed.near
@@ -119,7 +119,7 @@ def test_a_joint_that_never_moves_is_named() -> None:
         equations(held, model, base)
     # Another recording may move it, and whoever only judges needs no motion of it.
     assert equations([held, recording], model, base).samples > equations(recording, model, base).samples
-    assert equations(held, model, base, judging=True).samples > 0
+    assert equations(held, model, base, allow_still_joints=True).samples > 0
 
 
 def test_a_joint_whose_torque_is_always_zero_is_weighed() -> None:

@@ -15,7 +15,7 @@ from ident_service.config.load import load_arm
 from ident_service.config.motion_design import Design, Supply
 from ident_service.config.motion_limits import MotionLimits
 from ident_service.excitation.design import Designed
-from ident_service.excitation.limit_proof import certified_clearance, demands, violations
+from ident_service.excitation.limit_proof import certified_clearance, peak_bounds, violations
 from ident_service.excitation.optimal_design import Task
 from ident_service.excitation.search import Budget
 from ident_service.excitation.trajectory import Basis, FourierBasis, PostureBasis
@@ -86,7 +86,7 @@ def unproven(designed: Designed, model: ArmModel, limits: MotionLimits) -> Seque
     """What is wrong with a designed motion, everything looked at once more from its file."""
     path = designed.excitation.path
     found = violations(designed.proof, model, limits)
-    found += demands(path, model).violations(model.chain.names, limits, model.config.supply)
+    found += peak_bounds(path, model).violations(model.chain.names, limits, model.config.supply)
     clearance = certified_clearance(CollisionModel(model), path, model.config.workspace.clearance)
     return found if clearance.proven else [*found, f"clearance {clearance}"]
 

@@ -16,7 +16,7 @@ from ident_service.config.motion_design import Workspace
 from ident_service.errors import ModelError, MotionRefused
 from ident_service.excitation.described_motion import excitation
 from ident_service.excitation.limit_proof import certified_along, certified_clearance
-from ident_service.excitation.trajectory import FourierPath, FourierSeries, Path, PosturePath
+from ident_service.excitation.trajectory import FourierPath, FourierSeries, MotionPath, PosturePath
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.capsule_distances import CapsuleModel
 from ident_service.model.collision import CollisionModel
@@ -113,7 +113,7 @@ def free_arm(seed: int) -> tuple[ArmModel, CollisionModel]:
     return model, collision
 
 
-def random_path(seed: int, model: ArmModel) -> Path:
+def random_path(seed: int, model: ArmModel) -> MotionPath:
     rng = np.random.default_rng(seed)
     postures = random_postures(rng, model, 3)
     if rng.random() < 0.3:

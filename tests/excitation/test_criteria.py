@@ -55,7 +55,7 @@ def test_a_optimal_is_the_log_of_the_mean_variance_of_the_chosen_in_their_units(
     variances = np.diag(np.linalg.inv(W.T @ W))
     assert criterion("a_optimal", W.T @ W).value == pytest.approx(np.log(variances.mean()))
     wanted = np.log((variances / scale**2)[chosen].mean())
-    assert criterion("a_optimal", W.T @ W, chosen=chosen, scale=scale).value == pytest.approx(wanted)
+    assert criterion("a_optimal", W.T @ W, chosen_indices=chosen, parameter_scales=scale).value == pytest.approx(wanted)
 
 
 @given(seed=SEEDS, n=st.integers(1, 10))
@@ -91,9 +91,9 @@ def test_d_optimal_ranks_motions_alike_whatever_the_units(seed: int, n: int) -> 
 def test_a_optimal_in_units_of_the_scale_does_not_depend_on_the_units(seed: int, n: int) -> None:
     rng = np.random.default_rng(seed)
     W, scale, units = random_rows(seed, n), rng.uniform(0.1, 10.0, size=n), rng.uniform(0.1, 10.0, size=n)
-    plain = criterion("a_optimal", W.T @ W, scale=scale).value
+    plain = criterion("a_optimal", W.T @ W, parameter_scales=scale).value
     # A parameter u times as large in number is a column 1/u as large, and its scale is u times as large too.
-    changed = criterion("a_optimal", (W / units).T @ (W / units), scale=scale * units).value
+    changed = criterion("a_optimal", (W / units).T @ (W / units), parameter_scales=scale * units).value
     assert changed == pytest.approx(plain, abs=1e-8)
 
 

@@ -18,7 +18,7 @@ from ident_service.config.load import load_arm, shipped_arms
 from ident_service.config.motion_limits import MotionLimits, motion_limits
 from ident_service.errors import MotionRefused
 from ident_service.excitation.described_motion import excitation
-from ident_service.excitation.limit_proof import demands, require_within_limits
+from ident_service.excitation.limit_proof import peak_bounds, require_within_limits
 from ident_service.excitation.trajectory import FourierPath, FourierSeries
 from ident_service.model.arm_model import ArmModel, arm_model
 
@@ -57,7 +57,7 @@ def fine_extremes(series: FourierSeries, points: int) -> list[tuple[Array, Array
 
 
 def assert_bounds(series: FourierSeries, points: int) -> None:
-    asked = demands(once(series), bare_model(series.a.shape[0]))
+    asked = peak_bounds(once(series), bare_model(series.a.shape[0]))
     position, *derivatives = fine_extremes(series, points)
     swing = np.maximum(np.abs(position[0] - series.q0), np.abs(position[1] - series.q0))
     rounding = 1e-12 * (1.0 + np.abs(series.q0) + swing)
@@ -103,10 +103,10 @@ def test_torque_is_that_of_the_prior() -> None:
     rng = np.random.default_rng(5)
     bare = bare_model(3)
     series = FourierSeries(0.1, *rng.normal(size=(2, 3, 4)), rng.normal(size=3))
-    assert demands(once(series), bare).torque is None
+    assert peak_bounds(once(series), bare).torque is None
     delta = random_delta(rng, bare.layout)
-    single = demands(once(series), dataclasses.replace(bare, prior=delta)).torque
-    double = demands(once(series), dataclasses.replace(bare, prior=2.0 * delta)).torque
+    single = peak_bounds(once(series), dataclasses.replace(bare, prior=delta)).torque
+    double = peak_bounds(once(series), dataclasses.replace(bare, prior=2.0 * delta)).torque
     assert single is not None
     assert double is not None
     assert (single > 0.0).all()
@@ -126,7 +126,7 @@ def test_each_violation_names_joint_and_limit_and_nothing_else(what: str) -> Non
     model = arm_model(load_arm("planar2"))
     series = FourierSeries(0.1, np.full((2, 3), 0.2), np.full((2, 3), 0.1), np.zeros(2))
     tight = {"lower": np.array([-100.0, 0.0]), "upper": np.array([100.0, 0.0])}.get(what, np.array([1e6, 1e-3]))
-    found = demands(once(series), model).violations(model.chain.names, limits_of(model, **{what: tight}))
+    found = peak_bounds(once(series), model).violations(model.chain.names, limits_of(model, **{what: tight}))
     assert len(found) == 1
     assert found[0].startswith(f"elbow: {'position' if what in ('lower', 'upper') else what} ")
 
@@ -147,7 +147,7 @@ def test_shipped_motions_stay_inside_the_limits(arm: str, purpose: Any) -> None:
     model = arm_model(load_arm(arm))
     motion = excitation(model, purpose)
     limits = motion_limits(model.config)
-    assert demands(motion.path, model).violations(model.chain.names, limits, model.config.supply) == []
+    assert peak_bounds(motion.path, model).violations(model.chain.names, limits, model.config.supply) == []
     position, velocity, *_ = motion.path.at(np.linspace(0.0, motion.duration, 2000))
     assert (position >= limits.lower).all()
     assert (position <= limits.upper).all()
@@ -198,7 +198,7 @@ def test_seeded_motions_use_their_share_of_the_limits(seed: int, harmonics: int,
         assert use < 0.32
         assert "gravity alone" in str(refusal)  # noqa: PT017
         return
-    asked = demands(once(series), model)
+    asked = peak_bounds(once(series), model)
     shares = np.array(
         [
             np.maximum(asked.highest - middle, middle - asked.lowest) / (limits.upper - middle),

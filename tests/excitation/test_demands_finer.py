@@ -17,8 +17,14 @@ from ident_service.config.load import load_arm
 from ident_service.config.motion_design import Supply
 from ident_service.config.motion_limits import MotionLimits
 from ident_service.excitation.described_motion import excitation
-from ident_service.excitation.design import per_period
-from ident_service.excitation.limit_proof import PeakBounds, demands, power_bounds, stretches, torque_enclosures
+from ident_service.excitation.design import samples_per_period
+from ident_service.excitation.limit_proof import (
+    PeakBounds,
+    peak_bounds,
+    power_bounds,
+    time_intervals,
+    torque_enclosures,
+)
 from ident_service.excitation.trajectory import FourierBasis, FourierPath, PosturePath
 from ident_service.model.arm_model import ArmModel, arm_model, control_model
 from ident_service.model.parameter_layout import Layout
@@ -64,7 +70,7 @@ def fine_samples(path: FourierPath | PosturePath, finer: int) -> Iterator[Array]
     """Times of a grid `finer` times as fine as a design's, a block at a time."""
     if isinstance(path, FourierPath):
         basis = FourierBasis(path.series.base_frequency, path.series.a.shape[1], path.periods, path.ramp)
-        step = path.series.period / per_period(basis) / finer
+        step = path.series.period / samples_per_period(basis) / finer
     else:
         step = path.duration / 120 / finer
     for begin, end in path.distinct:
@@ -103,7 +109,7 @@ def assert_bounds(asked: PeakBounds, found: dict[str, Array]) -> None:
 def test_a_thousand_times_finer_nothing_exceeds_the_bounds(seed: int, joints: int) -> None:
     model = random_arm(seed, joints)
     path = random_fourier_path(seed, joints, harmonics=1 + seed % 3, ramps=False)
-    assert_bounds(demands(path, model), sampled(path, model, 1000))
+    assert_bounds(peak_bounds(path, model), sampled(path, model, 1000))
 
 
 @pytest.mark.slow
@@ -112,7 +118,7 @@ def test_a_thousand_times_finer_nothing_exceeds_the_bounds(seed: int, joints: in
 def test_nor_in_the_ramps(seed: int) -> None:
     model = random_arm(seed, 2)
     path = random_fourier_path(seed, 2, harmonics=2)
-    assert_bounds(demands(path, model), sampled(path, model, 1000))
+    assert_bounds(peak_bounds(path, model), sampled(path, model, 1000))
 
 
 @pytest.mark.slow
@@ -121,7 +127,7 @@ def test_nor_in_the_ramps(seed: int) -> None:
 def test_nor_on_segments_between_postures(seed: int) -> None:
     model = random_arm(seed, 2)
     path = random_posture_path(seed, 2)
-    assert_bounds(demands(path, model), sampled(path, model, 1000))
+    assert_bounds(peak_bounds(path, model), sampled(path, model, 1000))
 
 
 @pytest.mark.slow
@@ -142,7 +148,7 @@ def test_a_motion_without_violations_keeps_random_limits_a_thousand_times_finer(
         following_error=np.ones(2), kp=np.ones(2), kd=np.ones(2), home=np.zeros(2),
         **{name: wide[name] for name in ("velocity", "acceleration", "jerk", "torque")},
     )  # fmt: skip
-    violations = demands(path, model).violations(model.chain.names, limits, Supply(power=float(wide["power"])))
+    violations = peak_bounds(path, model).violations(model.chain.names, limits, Supply(power=float(wide["power"])))
     for name in ("velocity", "acceleration", "jerk", "torque"):
         for k, joint in enumerate(model.chain.names):
             if found[name][k] > wide[name][k]:
@@ -160,9 +166,9 @@ def test_torque_and_power_lie_inside_their_enclosures_stretch_by_stretch(seed: i
     assert model.config.supply is not None
     rng = np.random.default_rng(seed)
     # Long stretches too: then the enclosures have to do with more than rounding.
-    cells = stretches(path, float(rng.choice([0.01, 0.005, 0.0025])) / path.fastest(0.0, path.duration))
+    cells = time_intervals(path, float(rng.choice([0.01, 0.005, 0.0025])) / path.highest_frequency(0.0, path.duration))
     enclosed = torque_enclosures(cells, model, model.prior)
-    drawn = power_bounds(enclosed, cells.of(1), model.config.supply, model.chain.coupling)
+    drawn = power_bounds(enclosed, cells.enclosures(1), model.config.supply, model.chain.coupling)
     picked = rng.choice(len(cells.time), size=min(20, len(cells.time)), replace=False)
     for at in picked:
         q, dq, ddq, _ = path.at(cells.time[at] + cells.half[at] * np.linspace(-1.0, 1.0, 1000))
@@ -177,7 +183,7 @@ def test_torque_and_power_lie_inside_their_enclosures_stretch_by_stretch(seed: i
 @given(seed=SEEDS, joints=st.integers(1, 3))
 def test_bounds_are_tight_to_a_few_thousandths(seed: int, joints: int) -> None:
     model, path = without_dry_friction(random_arm(seed, joints)), random_path(seed, joints)
-    asked, found = demands(path, model), sampled(path, model, 20)
+    asked, found = peak_bounds(path, model), sampled(path, model, 20)
     swing = found["highest"] - found["lowest"]
     assert (asked.highest <= found["highest"] + 1e-3 * swing).all()
     assert (asked.lowest >= found["lowest"] - 1e-3 * swing).all()
@@ -192,7 +198,7 @@ def test_bounds_are_tight_to_a_few_thousandths(seed: int, joints: int) -> None:
 @given(seed=SEEDS)
 def test_slack_is_what_a_bound_may_be_above_the_truth(seed: int) -> None:
     model, path = without_dry_friction(random_arm(seed, 2)), random_path(seed, 2)
-    asked, found = demands(path, model), sampled(path, model, 20)
+    asked, found = peak_bounds(path, model), sampled(path, model, 20)
     for name, slack in asked.slack.items():
         if name == "power":
             continue
@@ -206,7 +212,7 @@ def test_slack_is_what_a_bound_may_be_above_the_truth(seed: int) -> None:
 @given(seed=SEEDS)
 def test_bounds_are_reached_about_when_they_are_said_to_be(seed: int) -> None:
     model, path = random_arm(seed, 2), random_path(seed, 2)
-    asked = demands(path, model)
+    asked = peak_bounds(path, model)
     for k in range(2):
         assert path.at(asked.when["highest"][k])[0][k] >= asked.highest[k] - asked.slack["highest"][k] - 1e-3
         speed = abs(path.at(asked.when["velocity"][k])[1][k])
@@ -222,7 +228,7 @@ def test_the_power_of_a_single_joint_is_torque_times_velocity_and_heat() -> None
     rate = 2.0 * np.pi
     path = random_fourier_path(0, 2, 1, ramps=False)
     series = replace(path.series, base_frequency=1.0, a=np.array([[0.5 * rate], [0.0]]), b=np.zeros((2, 1)))
-    asked = demands(FourierPath(series, 1), replace(model, prior=delta))
+    asked = peak_bounds(FourierPath(series, 1), replace(model, prior=delta))
     time = np.linspace(0.0, 1.0, 100_001)
     tau, speed = -0.5 * rate**2 * np.sin(rate * time), 0.5 * rate * np.cos(rate * time)
     expected = 3.0 + np.maximum(tau * speed + 0.01 * tau**2, 0.0).max()
@@ -232,7 +238,7 @@ def test_the_power_of_a_single_joint_is_torque_times_velocity_and_heat() -> None
 
 def test_a_supply_that_is_too_weak_is_named() -> None:
     model, path = random_arm(7, 2), random_fourier_path(7)
-    asked = demands(path, model)
+    asked = peak_bounds(path, model)
     assert asked.power is not None
     n = np.full(2, 1e9)
     limits = MotionLimits(-n, n, n, n, n, n, n, n, n, 0.0 * n)
@@ -245,7 +251,7 @@ def test_a_supply_that_is_too_weak_is_named() -> None:
 @pytest.mark.parametrize("name", ["lowest", "highest", "velocity", "acceleration", "jerk", "torque", "power"])
 def test_a_bound_that_is_no_number_keeps_no_limit(name: str) -> None:
     model, path = random_arm(7, 2), random_fourier_path(7)
-    asked = demands(path, model)
+    asked = peak_bounds(path, model)
     broken = replace(asked, **{name: getattr(asked, name) * np.nan})
     n = np.full(2, 1e9)
     limits = MotionLimits(-n, n, n, n, n, n, n, n, n, 0.0 * n)
@@ -255,4 +261,4 @@ def test_a_bound_that_is_no_number_keeps_no_limit(name: str) -> None:
 @pytest.mark.slow
 def test_the_published_motion_of_the_wam_a_thousand_times_finer(wam7: ArmModel) -> None:
     path = excitation(wam7, "identification").path
-    assert_bounds(demands(path, wam7), sampled(path, wam7, 1000))
+    assert_bounds(peak_bounds(path, wam7), sampled(path, wam7, 1000))

@@ -12,7 +12,7 @@ from design_bench import ONE_START, moves, quick, small, unproven
 
 from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import MotionRefused
-from ident_service.excitation.design import Designed, complete_task, criterion_of, design_motion, family
+from ident_service.excitation.design import Designed, complete_task, criterion_of, design_motion, motion_family
 from ident_service.excitation.motion_file import excitation_from_json
 from ident_service.excitation.optimal_design import usable_limits
 from ident_service.excitation.search import Budget
@@ -91,7 +91,7 @@ def test_the_file_says_how_the_motion_was_made_and_what_was_proven() -> None:
 @pytest.mark.parametrize("starts", [2, pytest.param(4, marks=pytest.mark.campaign)])
 def test_more_starts_are_never_worse(starts: int) -> None:
     model, design = small(), quick()
-    basis, base = family(design, model)
+    basis, base = motion_family(design, model)
     task = complete_task(model, design, basis, base)
     few, more = (designed_once("planar2", "d_optimal", n) for n in (1, starts))
     worse, better = (criterion_of(task, designed.excitation.path, base) for designed in (few, more))

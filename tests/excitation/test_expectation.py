@@ -11,7 +11,7 @@ from motions import random_fourier_path
 
 from ident_service.config.arm import Control
 from ident_service.config.motion_limits import motion_limits
-from ident_service.excitation.design import complete_task, criterion_of, design_motion, family
+from ident_service.excitation.design import complete_task, criterion_of, design_motion, motion_family
 from ident_service.excitation.prediction import (
     NoiseModel,
     described_noise,
@@ -123,15 +123,15 @@ def test_noise_is_the_simulated_driver_s_else_a_hundredth_of_the_torque() -> Non
 def test_a_motion_designed_with_earlier_information_teaches_more_of_the_rest(seed: int) -> None:
     # Half of the parameters are known already, a thousand times better than one motion will tell.
     model, design = MODEL, quick(criterion="a_optimal")
-    basis, base = family(design, model)
+    basis, base = motion_family(design, model)
     noise = described_noise(model, motion_limits(model.config))
     without = design_motion(model, design, seed=seed, budget=ONE_START).excitation.path
     # Known are the inertias and moments of first order; unknown the friction.
     known = np.array([expression.startswith(("L", "l", "m", "I")) for expression in base.expressions])
     added = np.diag(np.where(known, 1e6 / expected_deviations(without, model, base, noise) ** 2, 0.0))
-    with_added = design_motion(model, design, seed=seed, budget=ONE_START, added=added).excitation.path
+    with_added = design_motion(model, design, seed=seed, budget=ONE_START, earlier_information=added).excitation.path
     deviations = [expected_deviations(path, model, base, noise, added) for path in (without, with_added)]
-    task = complete_task(model, design, basis, base, added=added)
+    task = complete_task(model, design, basis, base, earlier_information=added)
     assert criterion_of(task, with_added, base) < criterion_of(task, without, base)
     assert task.scale is not None
     before, after = ((part / task.scale)[~known] ** 2 for part in deviations)

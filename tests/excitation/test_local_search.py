@@ -10,7 +10,7 @@ from design_bench import quick, small
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident_service.excitation.design import complete_task, family, safe_posture
+from ident_service.excitation.design import complete_task, motion_family, safe_posture
 from ident_service.excitation.optimal_design import Problem
 from ident_service.excitation.search import (
     Candidate,
@@ -29,7 +29,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 def bench() -> tuple[Problem, Array]:
     """A small problem, and standing still in its safe posture."""
     model, design = small(), quick()
-    task = complete_task(model, design, *family(design, model))
+    task = complete_task(model, design, *motion_family(design, model))
     return Problem(task, 60), task.basis.standing(safe_posture(model, task.limits))
 
 
@@ -68,7 +68,7 @@ def test_what_is_kept_is_the_largest_motion_that_keeps_the_limits(seed: int, siz
     if within_limits(PROBLEM, X):
         np.testing.assert_allclose(candidate.coefficients, X, atol=1e-12)
         return
-    middle = PROBLEM.task.basis.still(X)
+    middle = PROBLEM.task.basis.standing_at_middle(X)
     anchor = middle if within_limits(PROBLEM, middle) else SAFE
     larger = anchor + 1.01 * (candidate.coefficients - anchor)
     assert not within_limits(PROBLEM, larger)
@@ -79,7 +79,7 @@ def test_what_is_kept_is_the_largest_motion_that_keeps_the_limits(seed: int, siz
 def test_a_random_start_is_a_motion_about_a_posture_within_the_limits(seed: int) -> None:
     task = PROBLEM.task
     x = random_variables(PROBLEM, np.random.default_rng(seed), SAFE)
-    middle = task.basis.still(PROBLEM.coefficients(x))[:, -1]
+    middle = task.basis.standing_at_middle(PROBLEM.coefficients(x))[:, -1]
     assert ((task.limits.lower <= middle) & (middle <= task.limits.upper)).all()
     again = random_variables(PROBLEM, np.random.default_rng(seed), SAFE)
     np.testing.assert_array_equal(x, again)

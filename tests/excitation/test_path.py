@@ -33,10 +33,12 @@ def away_from_seams(path: FourierPath | PosturePath, count: int) -> Array:
 def test_each_derivative_is_the_slope_of_the_one_before(seed: int) -> None:
     path = random_path(seed)
     time, step = away_from_seams(path, 9), 1e-3 * float(np.diff(path.seams).min())
-    step = min(step, 1e-3 / path.fastest(0.0, path.duration))
+    step = min(step, 1e-3 / path.highest_frequency(0.0, path.duration))
     values = path.derivatives(time, 4)
     for order in range(4):
-        size = np.abs(values[order + 1]).max() + np.abs(values[order]).max() * path.fastest(0.0, path.duration)
+        size = np.abs(values[order + 1]).max() + np.abs(values[order]).max() * path.highest_frequency(
+            0.0, path.duration
+        )
         np.testing.assert_allclose(stencil(path, order, time, step), values[order + 1], rtol=0, atol=1e-6 * size)
 
 
@@ -111,7 +113,7 @@ def test_periods_repeat(seed: int, share: float) -> None:
         for one, other in zip(path.at(first), path.at(first + again * path.series.period), strict=True):
             size = 1.0 + np.abs(one).max()
             # Where the last period goes over into the ramp both are the same up to rounding.
-            fastest = max(1.0, path.fastest(0.0, path.duration))
+            fastest = max(1.0, path.highest_frequency(0.0, path.duration))
             np.testing.assert_allclose(one, other, rtol=0, atol=1e-8 * size * fastest**3)
 
 

@@ -7,7 +7,7 @@ import pytest
 from design_bench import ONE_START, moves, quick, small, unproven
 
 from ident_service.config.motion_limits import motion_limits
-from ident_service.excitation.design import design_motion, family
+from ident_service.excitation.design import design_motion, motion_family
 from ident_service.excitation.optimal_design import usable_limits
 from ident_service.excitation.prediction import described_noise, expected_deviations
 from ident_service.excitation.trajectory import PostureBasis, PosturePath
@@ -52,7 +52,7 @@ def test_a_few_postures_in_a_tiny_workspace_teach_all_static_parameters_and_ever
 @pytest.mark.slow
 def test_a_description_can_ask_for_postures() -> None:
     design = quick(motion="postures", postures=4, way=1.0, dwell=0.1)
-    basis, base = family(design, TINY)
+    basis, base = motion_family(design, TINY)
     assert base.expressions == STATIC.expressions
     path = design_motion(TINY, design, budget=ONE_START).excitation.path
     assert isinstance(path, PosturePath)

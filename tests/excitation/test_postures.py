@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ident_service.config.motion_limits import MotionLimits, motion_limits
-from ident_service.excitation.design import complete_task, family, safe_posture
+from ident_service.excitation.design import complete_task, motion_family, safe_posture
 from ident_service.excitation.optimal_design import Problem, usable_limits
 from ident_service.excitation.search import within_limits
 from ident_service.model.arm_model import ArmModel
@@ -56,7 +56,7 @@ def test_a_posture_is_not_at_the_end_of_a_range() -> None:
     limits = usable(model)
     posture = safe_posture(model, limits)
     assert ((limits.lower < posture) & (posture < limits.upper)).all()
-    basis, base = family(quick(), model)
+    basis, base = motion_family(quick(), model)
     problem = Problem(complete_task(model, quick(), basis, base), 40)
     assert within_limits(problem, basis.standing(posture))
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from ident_service.config.motion_design import Design, Workspace
 from ident_service.config.motion_limits import MotorLimits
-from ident_service.excitation.design import complete_task, family
+from ident_service.excitation.design import complete_task, motion_family
 from ident_service.excitation.optimal_design import Problem, usable_limits
 from ident_service.excitation.search import within_limits
 from ident_service.excitation.trajectory import Basis
@@ -169,7 +169,7 @@ def test_what_keeps_the_limits_keeps_them_at_every_sample(basis: Basis, seed: in
 
 def test_standing_still_in_a_good_posture_keeps_all_limits_and_ten_times_a_motion_does_not() -> None:
     model, design = small(), quick()
-    basis, base = family(design, model)
+    basis, base = motion_family(design, model)
     problem = Problem(complete_task(model, design, basis, base), 60)
     hanging = basis.standing(np.array([-1.5, 0.0]))
     assert within_limits(problem, hanging)

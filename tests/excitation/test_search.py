@@ -16,15 +16,15 @@ import pytest
 from design_bench import quick, small
 
 from ident_service.errors import UsageError
-from ident_service.excitation.design import complete_task, design_motion, family, safe_posture
+from ident_service.excitation.design import complete_task, design_motion, motion_family, safe_posture
 from ident_service.excitation.optimal_design import Problem
 from ident_service.excitation.search import (
     Budget,
     Progress,
     SearchResult,
-    found_to_json,
-    read_found,
+    read_search,
     search,
+    search_to_json,
     within_limits,
 )
 
@@ -33,7 +33,7 @@ GRID = 60
 
 def bench() -> tuple[Any, np.ndarray]:
     model, design = small(), quick()
-    task = complete_task(model, design, *family(design, model))
+    task = complete_task(model, design, *motion_family(design, model))
     return task, safe_posture(model, task.limits)
 
 
@@ -98,7 +98,7 @@ def test_candidates_keep_all_limits_and_the_best_comes_first() -> None:
 @pytest.mark.slow
 def test_a_search_goes_on_where_it_ended() -> None:
     first, _ = searched(1)
-    all_three = starts(2, earlier=first)
+    all_three = starts(2, earlier_search=first)
     assert all_three.finished == 3
     assert {candidate.start for candidate in all_three.candidates} == {0, 1, 2}
     assert all_three.candidates[0].value <= first.candidates[0].value
@@ -114,18 +114,18 @@ def test_a_search_goes_on_where_it_ended() -> None:
 def test_a_search_with_another_guess_of_friction_is_another_search(tmp_path: Path) -> None:
     """Its candidates follow otherwise, so that what it found may not follow at all."""
     model, design = small(), quick(friction_guess=(0.1, 0.05))
-    other = complete_task(model, design, *family(design, model))
+    other = complete_task(model, design, *motion_family(design, model))
     file = tmp_path / "search.json"
-    file.write_text(found_to_json(starts(0), TASK))
-    assert read_found(file, TASK, 5).seed == 5
+    file.write_text(search_to_json(starts(0), TASK))
+    assert read_search(file, TASK, 5).seed == 5
     with pytest.raises(UsageError, match="another arm, criterion, margin, friction"):
-        read_found(file, other, 5)
+        read_search(file, other, 5)
 
 
 def test_going_on_without_another_start_never_makes_the_best_worse() -> None:
     found, _ = searched(1)
     for _ in range(3):
-        again = starts(0, earlier=found)
+        again = starts(0, earlier_search=found)
         assert again.candidates[0].value <= found.candidates[0].value
         found = again
 
@@ -216,7 +216,7 @@ def test_a_budget_too_short_for_a_single_climb_still_has_a_candidate() -> None:
 
 
 def test_time_spent_is_added_up() -> None:
-    found = starts(0, earlier=SearchResult(5, 3, 100.0, ()), clock=ticking())
+    found = starts(0, earlier_search=SearchResult(5, 3, 100.0, ()), clock=ticking())
     assert found.finished == 3
     assert 100.0 < found.seconds < 100.1
 

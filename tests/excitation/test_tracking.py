@@ -17,9 +17,9 @@ from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import MotionRefused
 from ident_service.excitation.active_limits import (
     active_limit_lines,
-    binding,
+    active_limits,
     forces_of,
-    gain_words,
+    improvement_words,
     needed_stiffness,
     stiffer_gains,
 )
@@ -29,10 +29,10 @@ from ident_service.excitation.design import (
     complete_task,
     criterion_of,
     design_motion,
-    family,
-    per_period,
+    motion_family,
     require_known_inertia,
     safe_posture,
+    samples_per_period,
 )
 from ident_service.excitation.limit_proof import certified_clearance, proof_of, scale_to_verified, violations
 from ident_service.excitation.motion_file import Excitation
@@ -110,7 +110,7 @@ def test_a_soft_joint_of_unknown_drives_is_refused_and_says_what_to_write(known:
     prior = {name: value for name, value in zip(document["names"], document["values"], strict=True) if name != "Ia2"}
     joints = {"elbow": {"kp": 5.0, "kd": 4.0, "following_error": 0.02} | ({"drive_inertia": 0.01} if known else {})}
     model = small(joints=joints, prior=prior)
-    task = complete_task(model, quick(), *family(quick(), model))
+    task = complete_task(model, quick(), *motion_family(quick(), model))
     safe = safe_posture(model, task.limits)
     if known:
         require_known_inertia(model, task, safe)
@@ -121,11 +121,11 @@ def test_a_soft_joint_of_unknown_drives_is_refused_and_says_what_to_write(known:
 
 def test_limits_of_a_motion_that_teaches_next_to_nothing_can_be_told() -> None:
     model, design = small(), quick()
-    task = complete_task(model, design, *family(design, model))
+    task = complete_task(model, design, *motion_family(design, model))
     limits, basis = motion_limits(model.config), task.basis
     wriggle = np.random.default_rng(0).normal(scale=1e-5, size=(2, basis.size))
     held = basis.standing(task.limits.upper) + np.where(basis.moving, wriggle, 0.0)  # at a limit all the time
-    found = binding(task, held, per_period(basis))
+    found = active_limits(task, held, samples_per_period(basis))
     assert max(one.exponent for one in found) == 50.0
     assert "is limited by its position range" in active_limit_lines(found, task, limits, limits.velocity, ("", ""))[0]
 
@@ -135,7 +135,7 @@ def test_clearance_is_the_arm_s_and_not_the_reference_s() -> None:
     path = excitation(model, "identification").path
     collision, tracking = CollisionModel(model), track(path, model, 0.2)
     reference = certified_clearance(collision, path, 0.02)
-    arm = certified_clearance(collision, path, 0.02, tracking.width)
+    arm = certified_clearance(collision, path, 0.02, tracking.tube_width)
     reach = np.array(collision.reach)
     assert arm.lower_bound < reference.lower_bound
     # No pair comes nearer than the whole tube allows.
@@ -152,20 +152,20 @@ def test_the_last_ramp_of_a_motion_of_many_periods_has_the_tube_of_the_simulated
     for back in (0.9, 0.5, 0.1):
         times = np.array([0.5, 5.0, once.duration - back])
         later = np.array([0.5, 5.0, often.duration - back])
-        np.testing.assert_allclose(short.width(times, half), long.width(later, half))
+        np.testing.assert_allclose(short.tube_width(times, half), long.tube_width(later, half))
 
 
 def polished(model: ArmModel, design: Design) -> tuple[Task, Candidate, Callable[[Task], Candidate]]:
     """A task, the best motion of one start, and what a polish from there finds for another task."""
-    task = complete_task(model, design, *family(design, model))
+    task = complete_task(model, design, *motion_family(design, model))
     safe = task.basis.standing(safe_posture(model, task.limits))
-    problem = Problem(task, per_period(task.basis))
+    problem = Problem(task, samples_per_period(task.basis))
     x = random_variables(problem, np.random.default_rng(1), safe)
     start = local_search(problem, x, safe, 0, lambda: None).coefficients
     best = local_search(problem, problem.variables(start), safe, 0, lambda: None, polish=True)
 
     def from_there(other: Task) -> Candidate:
-        problem = Problem(other, per_period(other.basis))
+        problem = Problem(other, samples_per_period(other.basis))
         return local_search(problem, problem.variables(best.coefficients), safe, 0, lambda: None, polish=True)
 
     return task, best, from_there
@@ -176,7 +176,7 @@ def test_a_wider_active_limit_gains_as_predicted() -> None:
     """A slower joint is held by its velocity; a design with a little more of it gains what the multiplier says."""
     model = small(joints={"elbow": {"velocity": 0.6}})
     task, best, from_there = polished(model, quick())
-    found = binding(task, best.coefficients, per_period(task.basis))
+    found = active_limits(task, best.coefficients, samples_per_period(task.basis))
     expected = {(one.limit, one.joint): one.exponent for one in found}["velocity", 1]
     assert expected > 0.05
     velocity = task.limits.velocity * np.array([1.0, 1.1])
@@ -211,7 +211,7 @@ def soft() -> tuple[Task, Candidate, Callable[[Task], Candidate]]:
 @pytest.mark.slow
 def test_stiffer_gains_help_as_predicted(soft: tuple[Task, Candidate, Callable[[Task], Candidate]]) -> None:
     task, best, from_there = soft
-    found = binding(task, best.coefficients, per_period(task.basis))
+    found = active_limits(task, best.coefficients, samples_per_period(task.basis))
     expected = sum(one.by_gain for one in found if one.joint == 1)
     assert expected > 0.05
     stiffer = from_there(replace(task, limits=replace(task.limits, kp=task.limits.kp * np.array([1.0, 1.1]))))
@@ -223,8 +223,11 @@ def test_gains_are_proposed_only_as_stiff_as_is_stable(
     soft: tuple[Task, Candidate, Callable[[Task], Candidate]],
 ) -> None:
     task, best, _ = soft
-    found, limits = binding(task, best.coefficients, per_period(task.basis)), motion_limits(task.model.config)
-    needed = needed_stiffness(task, best.coefficients, per_period(task.basis))
+    found, limits = (
+        active_limits(task, best.coefficients, samples_per_period(task.basis)),
+        motion_limits(task.model.config),
+    )
+    needed = needed_stiffness(task, best.coefficients, samples_per_period(task.basis))
     most = 40.0 * needed[1]  # times the kp that there is
 
     def words(allowed: float) -> str:
@@ -292,7 +295,7 @@ def test_where_a_motion_s_own_middle_is_a_bad_place_it_shrinks_towards_the_safe_
     ],
 )
 def test_a_gain_is_a_percentage_until_a_factor_says_more(criterion: Criterion, factor: float, words: str) -> None:
-    assert gain_words(criterion, factor) == words
+    assert improvement_words(criterion, factor) == words
 
 
 @pytest.mark.campaign
@@ -305,13 +308,15 @@ def test_what_a_proof_objects_to_is_searched_for_again_and_not_only_made_smaller
     model = small(joints={"shoulder": gains, "elbow": gains}, workspace=floor)
     design = quick()
     task, best, _ = polished(model, design)
-    base, safe = family(design, model)[1], safe_posture(model, task.limits)
+    base, safe = motion_family(design, model)[1], safe_posture(model, task.limits)
 
     def value(coefficients: np.ndarray) -> float:
         return criterion_of(task, task.basis.path(coefficients), base)
 
     prover = Prover(model, task, safe, design.torque_margin, value, lambda path: None)
-    smaller, mended = (prover.prove_best([best], per_period(task.basis), time, lambda: False) for time in (0.0, None))
+    smaller, mended = (
+        prover.prove_best([best], samples_per_period(task.basis), time, lambda: False) for time in (0.0, None)
+    )
     assert smaller is not None
     assert reason in smaller.why
     assert smaller.value > value(best.coefficients) + 0.01

@@ -11,7 +11,7 @@ from feasible.random_cases import random_case
 from ident_service.config.arm import FeasibleSetName
 from ident_service.config.load import load_arm
 from ident_service.estimation.feasible.central import ChangeEllipsoid, centre
-from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set, reference, symmetric
+from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set, reference_scale, symmetric
 from ident_service.estimation.feasible.formulation import EPSILON, LinkParameterMap
 from ident_service.estimation.feasible.problems import constrained_least_squares, feasibility_test
 from ident_service.model.arm_model import ArmModel, arm_model
@@ -95,7 +95,7 @@ def test_it_is_the_minimiser_that_another_solver_finds(likely: bool, moves: bool
     if near is not None:
         moved = np.linalg.norm(near.scaled_change(base.K @ found))
         assert 0.5 < moved < 1.0
-    scale = np.array([reference(name) for name in base.names])
+    scale = np.array([reference_scale(name) for name in base.names])
     np.testing.assert_allclose(delta.value / scale, found / scale, rtol=1e-3, atol=1e-3)
 
 

@@ -123,7 +123,7 @@ def test_an_estimate_to_compare_is_as_near_to_five_digits_and_inside() -> None:
     beta = np.array([-0.3, 0.1, 0.2, 0.05])
     fit = LeastSquares(beta, np.eye(4), beta, 0.0, np.eye(4), 4, np.ones(4), np.ones(1))
     exact = constrained_least_squares(fit, base, conditions)
-    near = constrained_least_squares(fit, base, conditions, enough=ENOUGH)
+    near = constrained_least_squares(fit, base, conditions, first_tolerance=ENOUGH)
     assert near.iterations < exact.iterations
     assert near.margin > 0.0
     np.testing.assert_allclose(near.objective, exact.objective, rtol=1e-5)
@@ -140,7 +140,7 @@ def test_a_rough_optimum_that_is_not_accepted_is_found_to_all_digits() -> None:
         tried.append(float(x[0]))
         return len(tried) > 1
 
-    found = minimise(problem, np.ones(1), "least", to_delta, conditions, accept=second, enough=1e-2)
+    found = minimise(problem, np.ones(1), "least", to_delta, conditions, accept=second, first_tolerance=1e-2)
     assert len(tried) == 2
     assert found.tolerance <= 1e-7
     assert abs(tried[1] - 1.0) < abs(tried[0] - 1.0)

@@ -30,7 +30,7 @@ from ident_service.fleet.factor import (
     settle,
     unpacked,
 )
-from ident_service.fleet.storage import Store, find
+from ident_service.fleet.storage import Store, find_files
 from ident_service.operations.recordings import open_for_arm
 from ident_service.recordings.mcap_writer import RecordingWriter
 
@@ -52,7 +52,7 @@ def folder(usual: Kind, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def described(usual: Kind, folder: Path) -> Described:
-    settled = settle(find([str(folder)]), usual.model.config.model_dump_json())
+    settled = settle(find_files([str(folder)]), usual.model.config.model_dump_json())
     assert isinstance(settled, Settled)
     assert len(settled.pilots) == 3
     return Described(settled.description)
@@ -71,7 +71,7 @@ def rows(folder: Path, described: Described, store: Store) -> list[Row]:
 
 
 def reduced(path: Path, described: Described, store: Store, **more: bool) -> Outcome:
-    (source,) = find([str(path)])
+    (source,) = find_files([str(path)])
     return reduce_recording(Part(source), described, store, __version__, **more)
 
 
@@ -83,7 +83,7 @@ def test_recordings_that_cannot_be_fitted_together_are_all_named(usual: Kind, tm
     for name in ("1.mcap", "2.mcap"):
         with RecordingWriter(tmp_path / name, usual.model.chain.names, "", round(BEGIN * 1e9)) as writer:
             write_samples(writer, round(BEGIN * 1e9), usual.stamps(len(rest)), rest, rest, np.ones_like(torque))
-    problems = settle(find([str(tmp_path)]), usual.model.config.model_dump_json())
+    problems = settle(find_files([str(tmp_path)]), usual.model.config.model_dump_json())
     assert not isinstance(problems, Settled)
     unreadable, at_rest = problems
     assert unreadable.url == str(tmp_path / "0.mcap")
@@ -102,7 +102,7 @@ def test_settled_choices_are_numbers(described: Described) -> None:
 def test_merged_factors_are_the_equations_of_all_recordings(
     rows: list[Row], folder: Path, described: Described, store: Store
 ) -> None:
-    merged = merge_stored([row.key for row in rows], described, store, whole=False)
+    merged = merge_stored([row.key for row in rows], described, store, cluster_by_recording=False)
     assert isinstance(merged, Merged)
     recordings = [open_for_arm(path, described.model) for path in sorted(folder.glob("*.mcap"))]
     together = equations(recordings, described.model, described.base)
@@ -163,11 +163,11 @@ def test_a_damaged_factor_is_named_and_can_be_made_again(
     keys = [row.key for row in rows]
     for broken in (content[:1000], content[:3000] + b"\xff" + content[3001:], b""):
         store.write(name, broken)
-        found = merge_stored(keys, described, store, whole=False)
+        found = merge_stored(keys, described, store, cluster_by_recording=False)
         assert merge([found]) == (rows[1].key,)
-    assert reduced(folder / "1.mcap", described, store, again=True).computed
+    assert reduced(folder / "1.mcap", described, store, recompute=True).computed
     assert store.read(name) == content
-    assert isinstance(merge_stored(keys, described, store, whole=False), Merged)
+    assert isinstance(merge_stored(keys, described, store, cluster_by_recording=False), Merged)
 
 
 def test_a_damaged_row_is_computed_again(folder: Path, rows: list[Row], described: Described, store: Store) -> None:
@@ -178,9 +178,9 @@ def test_a_damaged_row_is_computed_again(folder: Path, rows: list[Row], describe
 
 
 def test_the_tree_keeps_few_clusters(rows: list[Row], described: Described, store: Store) -> None:
-    one = merge_stored([rows[0].key], described, store, whole=False)
+    one = merge_stored([rows[0].key], described, store, cluster_by_recording=False)
     assert isinstance(one, Merged)
-    whole = merge_stored([rows[0].key], described, store, whole=True)
+    whole = merge_stored([rows[0].key], described, store, cluster_by_recording=True)
     assert isinstance(whole, Merged)
     assert len(whole.clusters) == 1
     many = merge([one] * 20)
@@ -190,13 +190,13 @@ def test_the_tree_keeps_few_clusters(rows: list[Row], described: Described, stor
 
 
 def test_pieces_of_a_recording_say_together_what_it_says(folder: Path, described: Described, store: Store) -> None:
-    (source,) = find([f"{folder}/0.mcap"])
+    (source,) = find_files([f"{folder}/0.mcap"])
     parts = [reduce_recording(Part(source, number, 2), described, store, __version__) for number in range(2)]
     found = [one.row for one in parts if one.row is not None]
     assert [row.label for row in found] == ["#1of2", "#2of2"]
     assert sum(row.seconds for row in found) == pytest.approx(15.0, abs=0.1)
-    pieces = merge_stored([row.key for row in found], described, store, whole=False)
-    whole = merge_stored([described.key(found[0].sha256, Part(source))], described, store, whole=False)
+    pieces = merge_stored([row.key for row in found], described, store, cluster_by_recording=False)
+    whole = merge_stored([described.key(found[0].sha256, Part(source))], described, store, cluster_by_recording=False)
     assert isinstance(pieces, Merged)
     assert isinstance(whole, Merged)
     # But for the edges of the filter at the cut.
@@ -234,7 +234,7 @@ def test_a_condition_that_is_no_number_is_named(
 
 
 def test_a_worker_of_another_version_says_so(folder: Path, described: Described, store: Store) -> None:
-    (source,) = find([f"{folder}/0.mcap"])
+    (source,) = find_files([f"{folder}/0.mcap"])
     outcome = reduce_recording(Part(source), described, store, "0.0.0")
     assert outcome.problem is not None
     assert outcome.problem.kind == "version"

@@ -136,7 +136,7 @@ def test_a_scheduler_that_is_not_there_is_named(tmp_path: Path, monkeypatch: pyt
     request = reduction.FleetRequest("planar2", ("x",), str(tmp_path), scheduler="tcp://127.0.0.1:9")
     with (
         pytest.raises(Unavailable, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"),
-        reduction.connected(request, lambda _: None),
+        reduction.dask_client(request, lambda _: None),
     ):
         pass
 
@@ -145,7 +145,7 @@ def test_what_is_no_address_of_a_scheduler_is_refused(tmp_path: Path) -> None:
     request = reduction.FleetRequest("planar2", ("x",), str(tmp_path), scheduler="cluster")
     with (
         pytest.raises(UsageError, match=r"^--scheduler cluster: give its address, such as tcp://HOST:8786$"),
-        reduction.connected(request, lambda _: None),
+        reduction.dask_client(request, lambda _: None),
     ):
         pass
 
@@ -161,7 +161,7 @@ def _fill(share: float) -> None:
 def test_a_worker_with_little_memory_left_goes_on(tmp_path: Path) -> None:
     """Above 80 % Dask would pause it, and the command waited for ever."""
     request = reduction.FleetRequest("planar2", ("x",), str(tmp_path), workers=1, memory="400MiB")
-    with reduction.connected(request, lambda _: None) as client:
+    with reduction.dask_client(request, lambda _: None) as client:
         client.submit(_fill, 0.87).result(timeout=60)
         time.sleep(1.0)  # in which its memory is looked at
         assert client.submit(os.getpid, pure=False).result(timeout=20) in client.run(os.getpid).values()
@@ -176,7 +176,7 @@ def test_a_worker_of_others_that_dask_pauses_is_named(tmp_path: Path, monkeypatc
         n_workers=1, memory_limit="400MiB", host="127.0.0.1", dashboard_address="127.0.0.1:0", silence_logs=50
     ) as cluster:
         request = reduction.FleetRequest("planar2", ("x",), str(tmp_path), scheduler=cluster.scheduler_address)
-        with reduction.connected(request, said.append) as client:
+        with reduction.dask_client(request, said.append) as client:
             client.submit(_fill, 0.87).result(timeout=60)
             until = time.monotonic() + 20.0
             while len(said) < 2 and time.monotonic() < until:

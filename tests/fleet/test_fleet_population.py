@@ -29,7 +29,7 @@ from ident_service.fleet.population import (
     unlike,
     variance_shares,
 )
-from ident_service.fleet.storage import Store, find
+from ident_service.fleet.storage import Store, find_files
 from ident_service.model.information import Information, triangle
 
 ARMS, TOOL = 10, 7
@@ -58,7 +58,7 @@ def fleet(usual: Kind, truths: list[np.ndarray], tmp_path_factory: pytest.TempPa
         for number in range(2):
             seconds = 3.2 if (arm, number) == (0, 0) else None
             write_recording(usual, place / f"{arm}-{number}.mcap", delta, seed=10 * arm + number, seconds=seconds)
-    sources = find([str(place)])
+    sources = find_files([str(place)])
     settled = settle(sources[2:4], usual.model.config.model_dump_json())
     assert isinstance(settled, Settled)
     global DESCRIBED, STORE
@@ -76,7 +76,7 @@ STORE: Store
 
 
 def merged(*rows: Row) -> Merged:
-    found = merge_stored([row.key for row in rows], DESCRIBED, STORE, whole=False)
+    found = merge_stored([row.key for row in rows], DESCRIBED, STORE, cluster_by_recording=False)
     assert isinstance(found, Merged)
     return found
 

@@ -12,7 +12,7 @@ from fsspec.implementations.memory import MemoryFileSystem
 
 from ident_service.errors import StorageError, UsageError
 from ident_service.fleet import storage
-from ident_service.fleet.storage import Source, Store, find, local_copy, persistently
+from ident_service.fleet.storage import Source, Store, find_files, local_copy, with_retries
 
 
 class UnsteadyFileSystem(MemoryFileSystem):
@@ -53,7 +53,7 @@ class UnsteadyFileSystem(MemoryFileSystem):
 def unsteady(monkeypatch: pytest.MonkeyPatch) -> Iterator[type[UnsteadyFileSystem]]:
     fsspec.register_implementation("unsteady", UnsteadyFileSystem, clobber=True)
     monkeypatch.setattr(storage, "PAUSES", (0.0, 0.0, 0.0))
-    monkeypatch.setattr(persistently, "__defaults__", ((0.0, 0.0, 0.0),))
+    monkeypatch.setattr(with_retries, "__defaults__", ((0.0, 0.0, 0.0),))
     monkeypatch.setattr(MemoryFileSystem, "store", {})
     yield UnsteadyFileSystem
     UnsteadyFileSystem.failures = UnsteadyFileSystem.cut = 0
@@ -63,24 +63,24 @@ def test_patterns_find_each_file_once_in_order(tmp_path: Path) -> None:
     for name in ("b/2.mcap", "a/1.mcap", "a/.hidden.mcap", "a/note.txt"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"12")
-    found = find([f"{tmp_path}/*/*.mcap", f"{tmp_path}/a/1.mcap"])
+    found = find_files([f"{tmp_path}/*/*.mcap", f"{tmp_path}/a/1.mcap"])
     assert [one.url.removeprefix(f"{tmp_path}/") for one in found] == ["a/1.mcap", "b/2.mcap"]
     assert [one.size for one in found] == [2, 2]
-    assert [one.name for one in find([str(tmp_path / "a")])] == ["1.mcap", "note.txt"]
+    assert [one.name for one in find_files([str(tmp_path / "a")])] == ["1.mcap", "note.txt"]
 
 
 def test_a_file_that_changed_has_another_state(tmp_path: Path) -> None:
     path = tmp_path / "1.mcap"
     path.write_bytes(b"one")
-    before = find([str(path)])
+    before = find_files([str(path)])
     path.write_bytes(b"two!")
-    assert find([str(path)])[0].state != before[0].state
+    assert find_files([str(path)])[0].state != before[0].state
 
 
 @pytest.mark.parametrize("pattern", ["nothing/*.mcap", "nothing.mcap", "strange://bucket/*.mcap"])
 def test_a_pattern_that_names_nothing_is_refused(pattern: str, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"names no recording|no storage"):
-        find([pattern if "://" in pattern else f"{tmp_path}/{pattern}"])
+        find_files([pattern if "://" in pattern else f"{tmp_path}/{pattern}"])
 
 
 def test_a_store_replaces_files_whole_and_leaves_nothing_half_written(tmp_path: Path) -> None:
@@ -89,7 +89,7 @@ def test_a_store_replaces_files_whole_and_leaves_nothing_half_written(tmp_path: 
     store.write("rows/one.json", b"first")
     store.write("rows/one.json", b"second")
     assert store.read("rows/one.json") == b"second"
-    assert list(store.names("rows")) == [("one.json", 6)]
+    assert list(store.list_files("rows")) == [("one.json", 6)]
     assert [path.name for path in (tmp_path / "store" / "rows").iterdir()] == ["one.json"]
 
 
@@ -97,7 +97,7 @@ def test_a_write_that_fails_leaves_the_earlier_file(tmp_path: Path, monkeypatch:
     store = Store(str(tmp_path))
     store.write("rows/one.json", b"first")
     monkeypatch.setattr(Path, "replace", _full_disk)
-    monkeypatch.setattr(persistently, "__defaults__", ((),))
+    monkeypatch.setattr(with_retries, "__defaults__", ((),))
     with pytest.raises(StorageError, match="No space left"):
         store.write("rows/one.json", b"second")
     assert store.read("rows/one.json") == b"first"
@@ -124,7 +124,7 @@ def test_storage_that_stays_away_is_named(unsteady: type[UnsteadyFileSystem]) ->
 
 def test_a_copy_that_came_short_is_fetched_again(unsteady: type[UnsteadyFileSystem]) -> None:
     fsspec.filesystem("unsteady").pipe_file("/arms/1.mcap", b"content")
-    (source,) = find(["unsteady://arms/*.mcap"])
+    (source,) = find_files(["unsteady://arms/*.mcap"])
     unsteady.cut = 1
     with local_copy(source) as copy:
         assert copy.read_bytes() == b"content"
@@ -149,7 +149,7 @@ def test_an_error_of_ours_is_not_tried_again() -> None:
         raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        persistently(wrong, "x", (0.0, 0.0))
+        with_retries(wrong, "x", (0.0, 0.0))
     assert len(tries) == 1
 
 
@@ -161,5 +161,5 @@ def test_what_may_not_be_read_is_refused_at_once() -> None:
         raise PermissionError(13, "Permission denied")
 
     with pytest.raises(StorageError, match=r"^s3://bucket/x: cannot be reached: \[Errno 13\] Permission denied$"):
-        persistently(denied, "s3://bucket/x", (0.0, 0.0))
+        with_retries(denied, "s3://bucket/x", (0.0, 0.0))
     assert len(tries) == 1

@@ -13,7 +13,7 @@ from ident_service.estimation.uncertainty import Uncertainty
 from ident_service.fleet.factor import Row
 from ident_service.fleet.population import ArmFit
 from ident_service.fleet.reduction import Recorded
-from ident_service.fleet.trends import Change, change_points, dependences, scatter_of, series
+from ident_service.fleet.trends import Change, change_points, dependences, parameter_series, scatter_of
 from ident_service.model.information import Information, triangle
 
 GROUPS: dict[tuple[Kind, int], tuple[int, ...]] = {
@@ -203,6 +203,6 @@ def test_a_series_has_its_interval() -> None:
     values = fleet(5)
     arms = {arm: [recorded(one, week) for week, one in enumerate(of_arm)] for arm, of_arm in values.items()}
     scatter = scatter_of(arms, GROUPS)
-    points = series(arms["03"], 3, 1, 1, scatter[("friction", 2)])
+    points = parameter_series(arms["03"], 3, 1, 1, scatter[("friction", 2)])
     np.testing.assert_allclose(points[:, 1], [one[3] for one in values["03"]])
     assert np.all((points[:, 2] > 1.9 * NOISE) & (points[:, 2] < 3.0 * NOISE))

@@ -28,7 +28,7 @@ from ident_service.fleet.population import (
 )
 from ident_service.fleet.reduction import FleetRequest, Recorded
 from ident_service.fleet.results import group_name
-from ident_service.fleet.storage import find
+from ident_service.fleet.storage import find_files
 from ident_service.fleet.trends import Compared, compare_arms
 from ident_service.model.blas_threads import one_blas_thread
 
@@ -75,7 +75,7 @@ def settled(of: Kind, deltas: Sequence[np.ndarray], seed: int) -> Described:
     with TemporaryDirectory() as folder:
         for number, delta in enumerate(deltas):
             write_recording(of, Path(folder, f"{number}.mcap"), delta, seed=seed + number)
-        found = settle(find([folder]), of.model.config.model_dump_json())
+        found = settle(find_files([folder]), of.model.config.model_dump_json())
     assert isinstance(found, Settled)
     return Described(found.description)
 

@@ -19,7 +19,7 @@ from ident_service.cli.motion_commands import _report_text
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.errors import UsageError
 from ident_service.estimation.online import ParameterUncertainty
-from ident_service.estimation.target import LEAST_BLOCKS, Target, worst_share
+from ident_service.estimation.target import LEAST_BLOCKS, Target, worst_relative_deviation
 from ident_service.estimation.uncertainty import relative_deviations
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import ArmModel, arm_model
@@ -136,20 +136,20 @@ def doubt(model: ArmModel, values: float, deviation: float, blocks: int = LEAST_
 
 def test_the_rule(model: ArmModel) -> None:
     base = base_parameters(model.chain, model.layout)
-    everything = Target(0.1).places(base, "planar2")
+    everything = Target(0.1).base_indices(base, "planar2")
     assert everything.tolist() == list(range(base.size))
-    assert worst_share(doubt(model, 2.0, 0.1), everything) == pytest.approx(0.05)
+    assert worst_relative_deviation(doubt(model, 2.0, 0.1), everything) == pytest.approx(0.05)
     # As good as zero: a share of what is, the smallest of which counts.
-    assert worst_share(doubt(model, 0.0, 1e-3), everything) == pytest.approx(1e-3 / _AS_ZERO)
-    assert worst_share(doubt(model, 2.0, 0.1, LEAST_BLOCKS - 1), everything) == np.inf
+    assert worst_relative_deviation(doubt(model, 0.0, 1e-3), everything) == pytest.approx(1e-3 / _AS_ZERO)
+    assert worst_relative_deviation(doubt(model, 2.0, 0.1, LEAST_BLOCKS - 1), everything) == np.inf
     for unknown in (np.inf, np.nan):
-        assert worst_share(doubt(model, 2.0, unknown), everything) == np.inf
+        assert worst_relative_deviation(doubt(model, 2.0, unknown), everything) == np.inf
     mixed = doubt(model, 2.0, 0.1)
     mixed.deviations[:3] = 1.0, 0.02, np.inf
-    (second,) = chosen = Target(0.1, (base.expressions[1].replace(" ", ""),)).places(base, "planar2")
+    (second,) = chosen = Target(0.1, (base.expressions[1].replace(" ", ""),)).base_indices(base, "planar2")
     assert second == 1
-    assert worst_share(mixed, chosen) == pytest.approx(0.01)
-    assert worst_share(mixed, everything) == np.inf
+    assert worst_relative_deviation(mixed, chosen) == pytest.approx(0.01)
+    assert worst_relative_deviation(mixed, everything) == np.inf
     for share in (0.0, 1.0, -1.0, float("nan")):
         with pytest.raises(UsageError, match="above 0 and below 1"):
             require_target(Target(share), model)

@@ -93,7 +93,9 @@ def test_a_run_holds_what_neighbours_have_in_common() -> None:
         made = bootstrap(gathered, fit, BASE, POSITIVE, 60, seed=repetition, solve=free)
         assert made.run == lengths[-1]
         chosen.append(made.covariance.diagonal())
-        single.append(bootstrap(gathered, fit, BASE, POSITIVE, 60, repetition, free, run=1).covariance.diagonal())
+        single.append(
+            bootstrap(gathered, fit, BASE, POSITIVE, 60, repetition, free, blocks_per_run=1).covariance.diagonal()
+        )
     empirical = np.sqrt(np.mean(np.square(errors), axis=0)).mean()
     by_runs, by_blocks = (np.sqrt(np.mean(variances, axis=0)).mean() for variances in (chosen, single))
     assert np.median(lengths) >= 2
@@ -125,7 +127,7 @@ def test_a_replicate_is_the_estimate_from_the_blocks_it_drew() -> None:
     gathered, base, conditions = arm_equations()
     weights = np.array([0.4, 2.5])
     fit = ordinary_least_squares(gathered.total, weights)
-    made = bootstrap(gathered, fit, base, conditions, 3, seed=11, run=2)
+    made = bootstrap(gathered, fit, base, conditions, 3, seed=11, blocks_per_run=2)
     rng = np.random.default_rng(11)
     for beta in made.betas:
         times = block_resample_counts(rng, len(gathered.blocks), 2)
@@ -217,7 +219,7 @@ def test_what_cannot_be_drawn_is_refused() -> None:
     with pytest.raises(ModelError, match="1 replicates"):
         bootstrap(gathered, fit, base, conditions, 1)
     with pytest.raises(ModelError, match="runs of 31 blocks out of 30"):
-        bootstrap(gathered, fit, base, conditions, run=31)
+        bootstrap(gathered, fit, base, conditions, blocks_per_run=31)
     with pytest.raises(ModelError, match="intervals at 1"):
         bootstrap(gathered, fit, base, conditions, level=1.0)
     with pytest.raises(ModelError, match=r"beta\.shape=\(2,\)"):

@@ -96,7 +96,7 @@ def test_more_parameters_than_independent_samples_leaves_one_sample() -> None:
 def test_a_stricter_test_keeps_fewer() -> None:
     gathered = recorded(2)
     fit = ordinary_least_squares(gathered.total)
-    kept = [len(essential_parameters(gathered, fit, level=level).kept) for level in (1e-12, 0.05, 0.999)]
+    kept = [len(essential_parameters(gathered, fit, significance_level=level).kept) for level in (1e-12, 0.05, 0.999)]
     assert kept[0] <= kept[1] <= kept[2]
     assert kept[0] < kept[2]
 
@@ -120,4 +120,4 @@ def test_nothing_is_decided_about_what_is_not_seen() -> None:
         essential_parameters(gathered, fit)
     whole = recorded(0)
     with pytest.raises(ModelError, match="level=1"):
-        essential_parameters(whole, ordinary_least_squares(whole.total), level=1.0)
+        essential_parameters(whole, ordinary_least_squares(whole.total), significance_level=1.0)

@@ -84,25 +84,25 @@ def centre(
     base: BaseParameters,
     conditions: FeasibleSet,
     likely: LikelyBodies | None = None,
-    near: ChangeEllipsoid | None = None,
+    allowed_change: ChangeEllipsoid | None = None,
 ) -> Array:
-    """Return link parameters moved to the feasible set's centre near likely bodies, base parameters kept (or `near`).
+    """Return link parameters moved to the set's centre near likely bodies, base parameters within `allowed_change`.
 
     Args:
         delta: inside the feasible set (margin above 0), SI units, shape (parameters,).
         base: grouping of the parameters.
         conditions: the feasible set.
         likely: bodies to stay near to; ones of 1 kg and 0.1 m at each link's origin when None.
-        near: how far base parameters may move; none moves when None.
+        allowed_change: how far base parameters may move; none moves when None.
 
     Returns:
-        Link parameters with the same base parameters to rounding, or as near to them as `near` says, inside the set,
-        shape (parameters,); `delta` itself where rounding forbids a step.
+        Link parameters with the same base parameters to rounding, or as near to them as `allowed_change` says, inside
+        the set, shape (parameters,); `delta` itself where rounding forbids a step.
     """
     lift = LinkParameterMap(base)
-    N = np.zeros((0, base.size)) if near is None else near.metric
-    begin = np.zeros(0) if near is None else near.scaled_change(base.K @ delta)
-    moving = np.zeros(0, dtype=int) if near is None else np.flatnonzero(near.moves)
+    N = np.zeros((0, base.size)) if allowed_change is None else allowed_change.metric
+    begin = np.zeros(0) if allowed_change is None else allowed_change.scaled_change(base.K @ delta)
+    moving = np.zeros(0, dtype=int) if allowed_change is None else np.flatnonzero(allowed_change.moves)
     free = np.column_stack([lift.of_dependent, lift.of_beta[:, moving]])
     N = np.column_stack([np.zeros((len(N), len(lift.dependent))), N[:, moving]])
     E, _ = conditions.equality_rows()

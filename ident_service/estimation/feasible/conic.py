@@ -71,13 +71,13 @@ class ScaledProblem:
     maps: tuple[Array, ...]
     scale: float
 
-    def point(self, y: Array) -> Array:
+    def point(self, scaled_variables: Array) -> Array:
         """Return the variables x in the problem's original coordinates, from the scaled ones y."""
-        return np.asarray(self.origin + _apply(self.columns, y))
+        return np.asarray(self.origin + _apply(self.columns, scaled_variables))
 
-    def duals(self, found: Sequence[Array]) -> list[Array]:
+    def duals(self, scaled_duals: Sequence[Array]) -> list[Array]:
         """Return the multipliers in the problem's original coordinates, from those of the scaled problem."""
-        return [self.scale * _transposed(M, z) for M, z in zip(self.maps, found, strict=True)]
+        return [self.scale * _transposed(M, z) for M, z in zip(self.maps, scaled_duals, strict=True)]
 
 
 def precondition(
@@ -257,28 +257,33 @@ class ConicProblem:
         return ConicProblem(self.variables, list(self._rows), rough=self.rough)
 
     def minimise(
-        self, objective: Array, name: str, quadratic: Array | None = None, enough: float | None = None
+        self,
+        objective: Array,
+        problem_name: str,
+        hessian_diagonal: Array | None = None,
+        sufficient_tolerance: float | None = None,
     ) -> Solution:
         """Return the x that minimises an objective over the constraints added so far; raises SolverError.
 
         Args:
             objective: linear coefficients, shape (variables,).
-            name: name of the problem, for errors.
-            quadratic: non-negative diagonal of the Hessian, shape (variables,); the objective is
-                `objective^T x + x^T diag(quadratic) x / 2`.
-            enough: tolerance that is enough, of a problem that is posed once; None for nine digits, in any pose.
+            problem_name: name of the problem, for errors.
+            hessian_diagonal: non-negative diagonal of the Hessian, shape (variables,); the objective is
+                `objective^T x + x^T diag(hessian_diagonal) x / 2`.
+            sufficient_tolerance: tolerance that is enough, of a problem that is posed once; None for nine digits, in
+                any pose.
 
         Raises:
             SolverError: the solver stopped anywhere but at an optimum, in every pose; with the first pose's status.
         """
-        hessian = np.zeros(self.variables) if quadratic is None else quadratic
+        hessian = np.zeros(self.variables) if hessian_diagonal is None else hessian_diagonal
         around = np.zeros(self.variables)
         status, attempts, iterations, seconds = "", 0, 0, 0.0
         # Orthonormal coordinates make every constraint one of all variables, which costs twenty times as much.
         close = [attempt for attempt in _POSES if not (self.rough and attempt.around == "orthonormal")]
         tolerances = _TOLERANCES[-1:] if self.rough else _TOLERANCES
-        if enough is not None:
-            close, tolerances = close[:1], (enough,)
+        if sufficient_tolerance is not None:
+            close, tolerances = close[:1], (sufficient_tolerance,)
         for tolerance in tolerances:
             for attempt in tuple(close):
                 pose = precondition(self._rows, objective, hessian, around, attempt.around)
@@ -292,12 +297,12 @@ class ConicProblem:
                     return Solution(x, duals, value, iterations, seconds, tolerance, attempts)
                 status = status or str(result.status)
                 if result.status in _FINAL and attempt.around is None:
-                    raise SolverError(name, str(result.status))
+                    raise SolverError(problem_name, str(result.status))
                 if result.status != clarabel.SolverStatus.AlmostSolved:
                     close.remove(attempt)
                 if attempt.around is None and np.all(np.isfinite(x)):
                     around = x
-        raise SolverError(name, status)
+        raise SolverError(problem_name, status)
 
     def _duals(self, pose: ScaledProblem, z: Array) -> tuple[Array, ...]:
         ends = np.cumsum([len(rows.f) for rows in self._rows])[:-1]

@@ -22,16 +22,16 @@ import numpy as np
 from ident_service.errors import SolverError, UsageError
 from ident_service.estimation.custom import CustomError, CustomFunction
 from ident_service.estimation.feasible.conic import triangle_entries
-from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet, reference
+from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet, reference_scale
 from ident_service.estimation.feasible.formulation import (
     MULTIPLIER,
     OF_ESTIMATES,
     ConditionsError,
-    check,
     conflicting_constraints,
     insets,
-    largest,
     project,
+    require_consistent,
+    trace_unit,
     traces,
 )
 from ident_service.estimation.feasible.nearest import FeasibleEstimate
@@ -108,8 +108,8 @@ def convex_least_squares(
     prior: Prior | None = None,
     custom: CustomFunction | None = None,
     solver: str = SOLVER,
-    bound: float | None = None,
-    inside: bool = True,
+    trace_bound: float | None = None,
+    require_positive_margin: bool = True,
 ) -> ConvexEstimate:
     """Find through cvxpy the feasible base parameters of least torque error, plus prior distance and custom penalty.
 
@@ -120,8 +120,10 @@ def convex_least_squares(
         prior: prior that the estimate is drawn to; None for none.
         custom: the user's constraints and penalty.
         solver: any that `available_solvers` names.
-        bound: upper bound of each link's tr(P) [kg]; those of `formulation.py` in turn when None, none with a prior.
-        inside: whether the parameters must have a positive margin; a solver of first order may miss the inset of 1e-6.
+        trace_bound: upper bound of each link's tr(P) [kg]; those of `formulation.py` in turn when None, none with a
+            prior.
+        require_positive_margin: whether the parameters must have a positive margin; a solver of first order may miss
+            the inset of 1e-6.
 
     Raises:
         UsageError: the solver is not installed.
@@ -130,14 +132,14 @@ def convex_least_squares(
         ConditionsError: no parameters at all fulfil the conditions.
         SolverError: the solver stopped without an optimum.
     """
-    check(fit.beta, base, conditions)
+    require_consistent(fit.beta, base, conditions)
     name = require_solver(solver)
     if prior is not None and prior.weight == 0.0:
         prior = None
     posed = _Posed(fit, base, conditions, prior, custom)
     size = float(np.max(np.abs(fit.beta), initial=0.0))
     reaches = OF_ESTIMATES if prior is None else (np.inf,)
-    bounds = [reach * largest(conditions, size) for reach in reaches] if bound is None else [bound]
+    bounds = [reach * trace_unit(conditions, size) for reach in reaches] if trace_bound is None else [trace_bound]
     statuses: list[str] = []
     early: FeasibleEstimate | None = None
     for limit in bounds:
@@ -146,7 +148,7 @@ def convex_least_squares(
             statuses.append(status)
             if status in ("optimal", "optimal_inaccurate"):
                 found = posed.found(limit)
-                if found.margin <= 0.0 and inside:
+                if found.margin <= 0.0 and require_positive_margin:
                     continue
                 if status == "optimal":
                     return ConvexEstimate(found, solver.lower(), status)
@@ -167,22 +169,22 @@ def convex_least_squares(
     raise SolverError(f"{_NAME} by {solver.lower()}", f"{statuses[0]}{outside}")
 
 
-def objective(fit: LeastSquares, found: FeasibleEstimate, prior: Prior | None) -> float:
+def objective(fit: LeastSquares, estimate: FeasibleEstimate, prior: Prior | None) -> float:
     """Return the objective's value at an estimate: |R_1 beta - rho_1|, or the weighted sum with prior and penalty.
 
     Args:
         fit: the unconstrained least squares.
-        found: the estimate.
+        estimate: the estimate.
         prior: prior that the estimate is drawn to; None for none.
 
     Raises:
         ParameterError: the residual has no variance.
     """
     drawn = prior is not None and prior.weight > 0.0
-    if not drawn and found.penalty is None:
-        return found.objective
-    added = prior.weight * found.prior_distance if prior is not None else 0.0
-    return (found.objective / _sigma(fit, prior)) ** 2 + added + (found.penalty or 0.0)
+    if not drawn and estimate.penalty is None:
+        return estimate.objective
+    added = prior.weight * estimate.prior_distance if prior is not None else 0.0
+    return (estimate.objective / _sigma(fit, prior)) ** 2 + added + (estimate.penalty or 0.0)
 
 
 def _sigma(fit: LeastSquares, prior: Prior | None) -> float:
@@ -204,7 +206,7 @@ class _Posed:
 
         self._fit, self._base, self._conditions, self._prior = fit, base, conditions, prior
         self._custom = custom
-        self._scales = np.array([reference(name) for name in base.names])
+        self._scales = np.array([reference_scale(name) for name in base.names])
         self._x = cp.Variable(len(base.names))
         delta = cp.multiply(self._scales, self._x)
         inside = insets(conditions, base, fit.beta)
@@ -388,7 +390,14 @@ def second_opinion(
     if custom is not None:
         asked = next(name for name in (SOLVER, "scs", *available_solvers()) if name != before)
     second = convex_least_squares(
-        fit, base, conditions, prior=prior, custom=custom, solver=asked, bound=first.bound, inside=False
+        fit,
+        base,
+        conditions,
+        prior=prior,
+        custom=custom,
+        solver=asked,
+        trace_bound=first.bound,
+        require_positive_margin=False,
     )
     found = second.estimate
     apart = np.abs(found.beta - first.beta)

@@ -58,9 +58,9 @@ REFERENCE_INERTIA = REFERENCE_MASS * REFERENCE_LENGTH**2  # kg m^2
 REFERENCE_FRICTION = 0.1  # N m, N m s/rad and what else friction is measured in
 
 
-def reference(name: str) -> float:
+def reference_scale(parameter_name: str) -> float:
     """Return the order of magnitude [SI] that a link parameter is scaled by, chosen by its name's symbol."""
-    symbol = name.rstrip("0123456789")
+    symbol = parameter_name.rstrip("0123456789")
     if symbol == "m":
         return REFERENCE_MASS
     if symbol in ("lx", "ly", "lz"):
@@ -68,9 +68,9 @@ def reference(name: str) -> float:
     return REFERENCE_INERTIA if symbol.startswith("L") or symbol == "Ia" else REFERENCE_FRICTION
 
 
-def link_of(name: str) -> str:
+def link_number_of(parameter_name: str) -> str:
     """Return the digits that a parameter's name ends in: the number of its link, as text."""
-    return name[len(name.rstrip("0123456789")) :]
+    return parameter_name[len(parameter_name.rstrip("0123456789")) :]
 
 
 @dataclass(frozen=True)
@@ -92,15 +92,15 @@ class Block:
     scale: tuple[float, ...] = ()
 
     def smallest(self, delta: Array) -> float:
-        """Return the smallest eigenvalue of the block's matrix at `delta`, or its smallest number."""
+        """Return the smallest eigenvalue of the block's matrix at link parameters `delta`, or its smallest number."""
         return self._smallest(delta, np.ones(self.size or len(self.f)))
 
     def smallest_scaled(self, delta: Array) -> float:
-        """Return the largest t with block(delta) - t S positive semidefinite, S its reference scales."""
+        """Return the largest t with block(link parameters) - t S positive semidefinite, S its reference scales."""
         return self._smallest(delta, self.references())
 
     def largest_scaled(self, delta: Array) -> float:
-        """Return the largest magnitude among the block's numbers at `delta`, each divided by its reference scale."""
+        """Return the largest magnitude of the block's numbers at link parameters `delta`, over reference scales."""
         return float(np.max(np.abs(self.F @ delta + self.f) / self.references()))
 
     def _smallest(self, delta: Array, scale: Array) -> float:
@@ -112,10 +112,10 @@ class Block:
 
     def times(self, T: Array) -> Array:
         """Return F T, shape (entries, columns of T), from the nonzero columns of F."""
-        return np.asarray(self.F[:, self.felt] @ T[self.felt])
+        return np.asarray(self.F[:, self.parameter_indices] @ T[self.parameter_indices])
 
     @cached_property
-    def felt(self) -> NDArray[np.intp]:
+    def parameter_indices(self) -> NDArray[np.intp]:
         """Return the indices of the parameters that the block depends on: the columns of F that are not zero."""
         return np.flatnonzero(np.any(self.F != 0.0, axis=0))
 
@@ -145,23 +145,27 @@ def symmetric(entries: Array, size: int) -> Array:
     return matrix
 
 
-def matrix_block(name: str, rows: list[list[Row]], scale: tuple[float, ...], index: dict[str, int]) -> Block:
-    """Build the condition that a matrix with entries linear in the link parameters is positive semidefinite."""
+def matrix_block(
+    name: str, rows: list[list[Row]], reference_scales: tuple[float, ...], parameter_index: dict[str, int]
+) -> Block:
+    """Build the condition that a matrix, linear in link parameters (upper triangle read), is positive semidefinite."""
     size = len(rows)
-    F = np.zeros((size * (size + 1) // 2, len(index)))
+    F = np.zeros((size * (size + 1) // 2, len(parameter_index)))
     for entry, (i, j) in enumerate(triangle_entries(size)):
         for parameter, coefficient in rows[i][j].items():
-            F[entry, index[parameter]] += coefficient
-    return Block(name, size, F, np.zeros(len(F)), scale)
+            F[entry, parameter_index[parameter]] += coefficient
+    return Block(name, size, F, np.zeros(len(F)), reference_scales)
 
 
-def linear_block(name: str, rows: Sequence[tuple[Row, float]], scale: float, index: dict[str, int]) -> Block:
+def linear_block(
+    name: str, rows: Sequence[tuple[Row, float]], reference_scale: float, parameter_index: dict[str, int]
+) -> Block:
     """Build the condition that sums of link parameters and a constant, all of one unit, are not negative."""
-    F = np.zeros((len(rows), len(index)))
+    F = np.zeros((len(rows), len(parameter_index)))
     for entry, (row, _) in enumerate(rows):
         for parameter, coefficient in row.items():
-            F[entry, index[parameter]] = coefficient
-    return Block(name, 0, F, np.array([constant for _, constant in rows]), (scale,) * len(rows))
+            F[entry, parameter_index[parameter]] = coefficient
+    return Block(name, 0, F, np.array([constant for _, constant in rows]), (reference_scale,) * len(rows))
 
 
 Index = dict[str, int]
@@ -169,40 +173,40 @@ Index = dict[str, int]
 _ODD = {"xy": ("lz", "Lxz", "Lyz"), "yz": ("lx", "Lxy", "Lxz"), "xz": ("ly", "Lxy", "Lyz")}
 
 
-def configured_blocks(config: ArmConfig, links: Sequence[int], index: Index) -> list[Block]:
+def configured_blocks(config: ArmConfig, link_numbers: Sequence[int], index: Index) -> list[Block]:
     """Return the inequality conditions of a description: bounds of mass and its center, hulls, ellipsoids, signs.
 
     Args:
         config: of the arm.
-        links: numbers of the links, from 1, as in the parameters' names.
+        link_numbers: numbers of the links, from 1, as in the parameters' names.
         index: column of each link parameter.
 
     Raises:
         ParameterError: a hull whose points lie in one plane.
     """
     config = constraints_with_payload(config)
-    blocks = _masses(config, links, index)
-    for link, body in _bodies(config, links):
+    blocks = _masses(config, link_numbers, index)
+    for link, body in _bodies(config, link_numbers):
         if body.center_of_mass is not None:
             blocks.append(_box(link, body.center_of_mass, index))
         if body.hull is not None:
             blocks.append(_hull(link, body.hull, index))
         if body.ellipsoid is not None:
             blocks.append(_ellipsoid(link, body.ellipsoid, index))
-    return blocks + signs(config.constraints.positive, links, index)
+    return blocks + signs(config.constraints.positive, link_numbers, index)
 
 
-def symmetries(config: ArmConfig, links: Sequence[int], index: Index) -> list[Block]:
+def symmetries(config: ArmConfig, link_numbers: Sequence[int], index: Index) -> list[Block]:
     """Return, per symmetry plane of a link, the equalities that its odd moments are zero; none is repeated."""
     blocks = []
-    for link, body in _bodies(constraints_with_payload(config), links):
+    for link, body in _bodies(constraints_with_payload(config), link_numbers):
         gone: set[str] = set()
         for plane in dict.fromkeys(body.symmetry):
             names = [f"{symbol}{link}" for symbol in _ODD[plane] if symbol not in gone]
             gone |= set(_ODD[plane])
             F = np.zeros((len(names), len(index)))
             F[np.arange(len(names)), [index[name] for name in names]] = 1.0
-            scale = tuple(reference(name) for name in names)
+            scale = tuple(reference_scale(name) for name in names)
             blocks.append(Block(f"link {link}: symmetric about its {plane} plane", 0, F, np.zeros(len(names)), scale))
     return blocks
 
@@ -274,21 +278,21 @@ def _ellipsoid(link: int, body: Ellipsoid, index: Index) -> Block:
     return linear_block(f"link {link}: all mass inside its ellipsoid", [(row, 0.0)], REFERENCE_MASS, index)
 
 
-def signs(positive: Sequence[JointTerm], links: Sequence[int], index: Index) -> list[Block]:
+def signs(positive_terms: Sequence[JointTerm], link_numbers: Sequence[int], index: Index) -> list[Block]:
     """Return the conditions that joint terms such as friction are positive (eq. 28), for terms that the model has.
 
     Args:
-        positive: the terms.
-        links: numbers of the links, from 1.
+        positive_terms: the terms.
+        link_numbers: numbers of the links, from 1.
         index: column of each link parameter.
     """
     blocks = []
-    for term in positive:
-        for link in links:
+    for term in positive_terms:
+        for link in link_numbers:
             name = f"{TERM_SYMBOLS[term]}{link}"
             if name in index:
                 title = f"joint {link}: {term.replace('_', ' ')} positive"
-                blocks.append(linear_block(title, [({name: 1.0}, 0.0)], reference(name), index))
+                blocks.append(linear_block(title, [({name: 1.0}, 0.0)], reference_scale(name), index))
     return blocks
 
 
@@ -330,7 +334,7 @@ class FeasibleSet:
     equalities: tuple[Block, ...] = field(default=())
 
     def margin(self, delta: Array) -> tuple[float, str]:
-        """Return the smallest eigenvalue of all blocks and its block's name; positive inside, equalities aside."""
+        """Return the blocks' smallest eigenvalue at link parameters, and whose; positive inside but for equalities."""
         return min(
             (float(value), self.blocks[place].name)
             for group in self._by_size
@@ -348,14 +352,16 @@ class FeasibleSet:
     @cached_property
     def links(self) -> tuple[frozenset[str], ...]:
         """Return per block the numbers (as text) of the links whose parameters it depends on."""
-        return tuple(frozenset(link_of(self.names[column]) for column in block.felt) for block in self.blocks)
+        return tuple(
+            frozenset(link_number_of(self.names[column]) for column in block.parameter_indices) for block in self.blocks
+        )
 
     def scaled_margin(self, delta: Array) -> tuple[float, str]:
-        """Return the largest t with D(delta) - t S >= 0, S the reference scales, and the limiting block's name."""
+        """Return the largest t with D(link parameters) - t S >= 0, S reference scales, and the limiting block."""
         return min((block.smallest_scaled(delta), block.name) for block in self.blocks)
 
     def violation(self, delta: Array) -> tuple[float, str]:
-        """Return the largest equality error over its scale, and the equality's name; (0, "") without equalities."""
+        """Return link parameters' largest scaled equality error and which it is; (0, "") without equalities."""
         return max(((block.largest_scaled(delta), block.name) for block in self.equalities), default=(0.0, ""))
 
     def equality_rows(self) -> tuple[Array, Array]:
@@ -370,7 +376,7 @@ def feasible_set(
     names: Sequence[str],
     config: ArmConfig | None = None,
     *,
-    positive: Sequence[JointTerm] = (),
+    positive_terms: Sequence[JointTerm] = (),
 ) -> FeasibleSet:
     """Build the feasible set of named link parameters: each link's inertia, and the description's conditions.
 
@@ -378,7 +384,7 @@ def feasible_set(
         kind: condition on the inertias.
         names: link parameters in the order of delta; every link has all ten of eq. 13.
         config: description with the mass, centre-of-mass and sign conditions; none of these when None.
-        positive: joint terms that must be positive where there is no configuration.
+        positive_terms: joint terms that must be positive where there is no configuration.
 
     Raises:
         ParameterError: a hull whose points lie in one plane.
@@ -389,7 +395,7 @@ def feasible_set(
     blocks = [build(link, index) for link in links]
     equalities: list[Block] = []
     if config is None:
-        blocks += signs(positive, links, index)
+        blocks += signs(positive_terms, links, index)
     else:
         blocks += configured_blocks(config, links, index)
         equalities += symmetries(config, links, index)

@@ -15,7 +15,7 @@ import numpy as np
 
 from ident_service.errors import ParameterError, SolverError
 from ident_service.estimation.feasible.conic import ConicProblem, Solution
-from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet, link_of, reference
+from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet, link_number_of, reference_scale
 from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
 
@@ -63,8 +63,8 @@ def insets(conditions: FeasibleSet, base: BaseParameters, beta: Array) -> Array:
     for column, value in zip(base.base, beta, strict=True):
         name = base.names[column]
         if name.startswith(("L", "l", "m")):
-            size = abs(float(value)) / reference(name)
-            sizes[link_of(name)] = max(sizes.get(link_of(name), 0.0), size)
+            size = abs(float(value)) / reference_scale(name)
+            sizes[link_number_of(name)] = max(sizes.get(link_number_of(name), 0.0), size)
     found = []
     for links in conditions.links:
         size = max((sizes.get(link, 1.0) for link in links), default=1.0)
@@ -83,45 +83,45 @@ def constrain(problem: ConicProblem, block: Block, F: Array, f: Array) -> None:
 def minimise(
     problem: ConicProblem,
     objective: Array,
-    name: str,
+    problem_name: str,
     to_delta: tuple[Array, Array],
     conditions: FeasibleSet,
     *,
-    size: float = 1.0,
-    quadratic: Array | None = None,
+    largest_parameter: float = 1.0,
+    hessian_diagonal: Array | None = None,
     accept: Callable[[Array], bool] = lambda _: True,
-    reaches: Sequence[float] = OF_TESTS,
-    enough: float | None = None,
+    trace_bounds: Sequence[float] = OF_TESTS,
+    first_tolerance: float | None = None,
 ) -> Solution:
-    """Minimise an objective; return the first acceptable optimum among bounds (reaches) on the links' tr(P).
+    """Minimise an objective; return the first acceptable optimum among `trace_bounds` on the links' tr(P).
 
     Args:
         problem: problem with all its constraints.
         objective: linear coefficients, shape (variables,).
-        name: of the problem, for errors.
+        problem_name: of the problem, for errors.
         to_delta: T and d with delta = T x + d.
         conditions: feasible set whose links are bounded.
-        size: size of the largest base parameter, which a reach must not cut off.
-        quadratic: diagonal of the Hessian, shape (variables,).
+        largest_parameter: size of the largest base parameter, which a bound must not cut off.
+        hessian_diagonal: diagonal of the Hessian, shape (variables,).
         accept: whether an optimum is accurate enough to be used.
-        reaches: bounds of tr(P) to try, in turn.
-        enough: tolerance that is enough within the first reach; where it gives nothing, and when None, all digits are
-            asked for.
+        trace_bounds: bounds of tr(P) to try, in turn.
+        first_tolerance: tolerance that is enough within the first bound; where it gives nothing, and when None, all
+            digits are asked for.
 
     Raises:
         SolverError: no optimum within any reach, or none that is acceptable.
     """
     T, d = to_delta
-    trace, top = traces(conditions), largest(conditions, size)
+    trace, top = traces(conditions), trace_unit(conditions, largest_parameter)
     status = ""
-    tries = [(reach, None) for reach in reaches]
-    for reach, tolerance in tries if enough is None else [(reaches[0], enough), *tries]:
+    tries = [(reach, None) for reach in trace_bounds]
+    for reach, tolerance in tries if first_tolerance is None else [(trace_bounds[0], first_tolerance), *tries]:
         bounded = problem
         if np.isfinite(reach):
             bounded = problem.copy()
             bounded.nonnegative(-trace @ T / reach, top - trace @ d / reach)
         try:
-            solution = bounded.minimise(objective, name, quadratic, tolerance)
+            solution = bounded.minimise(objective, problem_name, hessian_diagonal, tolerance)
         except SolverError as error:
             if tolerance is not None:
                 continue
@@ -133,18 +133,18 @@ def minimise(
         if accept(solution.x):
             return replace(solution, bound=reach * top)
         status = status or "outside the set"
-    raise SolverError(name, status)
+    raise SolverError(problem_name, status)
 
 
-def largest(conditions: FeasibleSet, size: float) -> float:
-    """Return the size that bounds on tr(P) are multiples of: the largest of 1, `size` and the set's constants.
+def trace_unit(conditions: FeasibleSet, largest_parameter: float) -> float:
+    """Return the size that bounds on tr(P) are multiples of: the largest of 1, the parameter and the set's constants.
 
     Args:
         conditions: feasible set with the bounds.
-        size: of the largest base parameter.
+        largest_parameter: size of the largest base parameter.
     """
     numbers = (np.abs(block.f).max(initial=0.0) for block in conditions.blocks)
-    return max(1.0, size, *map(float, numbers))
+    return max(1.0, largest_parameter, *map(float, numbers))
 
 
 def traces(conditions: FeasibleSet) -> Array:
@@ -179,7 +179,7 @@ def project(delta: Array, conditions: FeasibleSet) -> Array:
     return moved
 
 
-def check(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> None:
+def require_consistent(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> None:
     """Raise ParameterError unless base parameters, grouping and feasible set fit each other in shape and names.
 
     Raises:

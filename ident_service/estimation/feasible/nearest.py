@@ -67,11 +67,11 @@ class FeasibleEstimate:
         base: BaseParameters,
         conditions: FeasibleSet,
         likely: LikelyBodies | None = None,
-        near: ChangeEllipsoid | None = None,
+        allowed_change: ChangeEllipsoid | None = None,
     ) -> FeasibleEstimate:
-        """Return the estimate with link parameters centred near likely ones; base parameters may move within `near`."""
-        delta = centre(self.delta, base, conditions, likely, near)
-        beta = self.beta if near is None else base.K @ delta
+        """Return the estimate with link parameters centred near likely ones, base parameters in `allowed_change`."""
+        delta = centre(self.delta, base, conditions, likely, allowed_change)
+        beta = self.beta if allowed_change is None else base.K @ delta
         return replace(self, beta=beta, delta=delta, margin=conditions.margin(delta)[0])
 
 
@@ -87,26 +87,26 @@ def add_conditions(problem: ConicProblem, conditions: FeasibleSet, to_delta: Arr
 def solve_inside(
     problem: ConicProblem,
     objective: Array,
-    name: str,
+    problem_name: str,
     to_delta: Array,
     conditions: FeasibleSet,
-    size: float,
-    quadratic: Array | None = None,
-    reaches: Sequence[float] = OF_ESTIMATES,
-    enough: float | None = None,
+    largest_parameter: float,
+    hessian_diagonal: Array | None = None,
+    trace_bounds: Sequence[float] = OF_ESTIMATES,
+    first_tolerance: float | None = None,
 ) -> tuple[Array, Solution]:
     """Solve a problem; return link parameters strictly inside the set and the solution; raises where there are none.
 
     Args:
         problem: problem with all its constraints, those of the set included.
         objective: linear coefficients, shape (variables,).
-        name: of the problem, for errors.
+        problem_name: of the problem, for errors.
         to_delta: delta = to_delta x.
         conditions: the set.
-        size: of the largest base parameter.
-        quadratic: diagonal of the Hessian, shape (variables,).
-        reaches: bounds of links' masses to try, in turn, see `formulation.py`.
-        enough: tolerance that is enough, where one is, see `formulation.py`.
+        largest_parameter: size of the largest base parameter.
+        hessian_diagonal: diagonal of the Hessian, shape (variables,).
+        trace_bounds: bounds of links' masses to try, in turn, see `formulation.py`.
+        first_tolerance: tolerance that is enough, where one is, see `formulation.py`.
 
     Returns:
         Delta, with a positive margin and the equalities fulfilled to the last digit, and the solution.
@@ -123,18 +123,18 @@ def solve_inside(
         solution = minimise(
             problem,
             objective,
-            name,
+            problem_name,
             (to_delta, np.zeros(len(to_delta))),
             conditions,
-            size=size,
-            quadratic=quadratic,
+            largest_parameter=largest_parameter,
+            hessian_diagonal=hessian_diagonal,
             accept=inside,
-            reaches=reaches,
-            enough=enough,
+            trace_bounds=trace_bounds,
+            first_tolerance=first_tolerance,
         )
     except SolverError as error:
         if blocks := conflicting_constraints(conditions):
-            raise ConditionsError(name, error.status, blocks) from error
+            raise ConditionsError(problem_name, error.status, blocks) from error
         raise
     return project(to_delta @ solution.x, conditions), solution
 
@@ -142,24 +142,24 @@ def solve_inside(
 def nearest(
     metric: Array,
     target: Array,
-    beta: Array,
+    unconstrained_beta: Array,
     base: BaseParameters,
     conditions: FeasibleSet,
-    name: str,
-    reaches: Sequence[float] = OF_ESTIMATES,
-    enough: float | None = None,
+    problem_name: str,
+    trace_bounds: Sequence[float] = OF_ESTIMATES,
+    first_tolerance: float | None = None,
 ) -> FeasibleEstimate:
-    """Return the feasible base parameters b that minimise |metric b - target|; raises ConditionsError where none exist.
+    """Return feasible base parameters b of least |metric b - target|; raises ConditionsError if there are none.
 
     Args:
         metric: shape (rows, base).
         target: shape (rows,).
-        beta: unconstrained base parameters, shape (base,).
+        unconstrained_beta: unconstrained base parameters, shape (base,).
         base: grouping of the parameters.
         conditions: the set.
-        name: of the problem, for errors.
-        reaches: bounds of links' masses to try, in turn, see `formulation.py`.
-        enough: tolerance that is enough, where one is, see `formulation.py`.
+        problem_name: of the problem, for errors.
+        trace_bounds: bounds of links' masses to try, in turn, see `formulation.py`.
+        first_tolerance: tolerance that is enough, where one is, see `formulation.py`.
 
     Raises:
         ConditionsError: no parameters at all fulfil the conditions.
@@ -178,15 +178,22 @@ def nearest(
     distance[1:, :n] = metric * columns / scale
     problem.second_order(distance, np.concatenate([[0.0], -target / scale]))
     to_delta = np.column_stack([lift.of_beta * columns, lift.of_dependent, np.zeros(len(base.names))])
-    add_conditions(problem, conditions, to_delta, insets(conditions, base, beta))
-    size = float(np.max(np.abs(beta), initial=0.0))
+    add_conditions(problem, conditions, to_delta, insets(conditions, base, unconstrained_beta))
+    size = float(np.max(np.abs(unconstrained_beta), initial=0.0))
     best: FeasibleEstimate | None = None
     failure: SolverError | None = None
     for weight in _WEIGHTS:
         objective = np.append(np.zeros(variables - 1), weight)
         try:
             delta, solution = solve_inside(
-                problem, objective, name, to_delta, conditions, size, reaches=reaches, enough=enough
+                problem,
+                objective,
+                problem_name,
+                to_delta,
+                conditions,
+                size,
+                trace_bounds=trace_bounds,
+                first_tolerance=first_tolerance,
             )
         except ConditionsError:
             raise
@@ -211,5 +218,5 @@ def nearest(
         if solution.attempts == 1 and solution.iterations <= HARD:
             break
     if best is None:
-        raise failure or SolverError(name, "no weight was tried")
+        raise failure or SolverError(problem_name, "no weight was tried")
     return best

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from ident_service.errors import ParameterError, SolverError
 from ident_service.estimation.feasible.central import ChangeEllipsoid
 from ident_service.estimation.feasible.conic import ConicProblem, triangle_entries
-from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet, feasible_set, reference, symmetric
+from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet, feasible_set, reference_scale, symmetric
 from ident_service.estimation.feasible.formulation import OF_TESTS, active_constraints, insets
 from ident_service.estimation.feasible.nearest import FeasibleEstimate, add_conditions, solve_inside
 from ident_service.estimation.least_squares import LeastSquares
@@ -70,7 +70,7 @@ class Prior:
     @cached_property
     def scales(self) -> Array:
         """Return the reference scale of each parameter [SI], shape (parameters,)."""
-        return np.array([reference(name) for name in self.names])
+        return np.array([reference_scale(name) for name in self.names])
 
     @cached_property
     def euclidean(self) -> NDArray[np.intp]:
@@ -177,40 +177,41 @@ def solve_with_prior(
 
 
 def move_off_boundary(
-    held: FeasibleEstimate,
+    boundary_estimate: FeasibleEstimate,
     base: BaseParameters,
     conditions: FeasibleSet,
     likely: LikelyBodies,
-    near: ChangeEllipsoid,
+    allowed_change: ChangeEllipsoid,
 ) -> FeasibleEstimate:
-    """Return the estimate moved into the set towards likely bodies, within `near`; unchanged where none is found there.
+    """Return the estimate moved inside towards likely bodies, within `allowed_change`; unchanged if none is found.
 
     Newton's method (`central.py`) needs room to begin: between links of tonnes whose masses cancel there is none.
 
     Args:
-        held: constrained least squares, pressed against the set.
+        boundary_estimate: constrained least squares, pressed against the set.
         base: grouping of the parameters.
         conditions: the set.
         likely: bodies that the estimate is drawn to.
-        near: how far base parameters may move.
+        allowed_change: how far base parameters may move.
 
     Returns:
-        `held` with other link values and nearly the same base parameters; `held` itself where the solver finds none.
+        `boundary_estimate` with other link values and nearly the same base parameters; itself where the solver finds
+        none.
     """
-    delta = held.delta.copy()  # friction keeps its value as prior
+    delta = boundary_estimate.delta.copy()  # friction keeps its value as prior
     links = np.array([name.rstrip("0123456789") in INERTIAL for name in conditions.names])
     delta[links] = likely.delta[links]
     delta = np.where(likely.drives > 0.0, likely.drives, delta)
     prior = Prior("entropic", conditions.names, delta, 1.0)
     try:
-        found = _within(prior, base, conditions, near, insets(conditions, base, held.beta))
+        found = _within(prior, base, conditions, allowed_change, insets(conditions, base, boundary_estimate.beta))
     except (ParameterError, SolverError):
-        return held
+        return boundary_estimate
     beta = base.K @ found
     inside = conditions.margin(found)[0]
-    if float(np.linalg.norm(near.scaled_change(beta))) < 1.0 and inside > 0.0:
-        return replace(held, beta=beta, delta=found, margin=inside)
-    return held
+    if float(np.linalg.norm(allowed_change.scaled_change(beta))) < 1.0 and inside > 0.0:
+        return replace(boundary_estimate, beta=beta, delta=found, margin=inside)
+    return boundary_estimate
 
 
 def _within(prior: Prior, base: BaseParameters, conditions: FeasibleSet, near: ChangeEllipsoid, inside: Array) -> Array:

@@ -21,10 +21,10 @@ from ident_service.estimation.feasible.formulation import (
     ConditionsError,
     LinkParameterMap,
     active_constraints,
-    check,
     constrain,
     insets,
     minimise,
+    require_consistent,
     traces,
 )
 from ident_service.estimation.feasible.nearest import HARD, FeasibleEstimate, nearest
@@ -120,7 +120,7 @@ def feasibility_test(beta: Array, base: BaseParameters, conditions: FeasibleSet)
         ParameterError: shapes or names do not fit.
         SolverError: the solver stopped without an optimum.
     """
-    check(beta, base, conditions)
+    require_consistent(beta, base, conditions)
     lift = LinkParameterMap(base)
     fixed = lift.of_beta @ beta
     E, e = conditions.equality_rows()
@@ -158,7 +158,7 @@ def _largest_margin(
     to_delta = np.column_stack([lift.of_dependent, np.zeros(len(fixed))])
     objective = np.append(np.zeros(dependents), -1.0)
     size = float(np.max(np.abs(fixed), initial=0.0))
-    return minimise(problem, objective, "feasibility test", (to_delta, fixed), conditions, size=size)
+    return minimise(problem, objective, "feasibility test", (to_delta, fixed), conditions, largest_parameter=size)
 
 
 def _shares(conditions: FeasibleSet, solution: Solution) -> tuple[tuple[str, float], ...]:
@@ -199,7 +199,7 @@ def feasibility_correction(
         ConditionsError: no parameters at all fulfil the conditions.
         SolverError: the solver stopped without an optimum.
     """
-    check(beta, base, conditions)
+    require_consistent(beta, base, conditions)
     metric = np.eye(base.size) if covariance is None else whitening(covariance, base)
     # A bound on masses depends on the size of beta, so on the base columns, which this metric must not.
     reaches = OF_TABLES if covariance is None else OF_TESTS
@@ -213,7 +213,7 @@ def constrained_least_squares(
     conditions: FeasibleSet,
     prior: Prior | None = None,
     *,
-    enough: float | None = None,
+    first_tolerance: float | None = None,
 ) -> FeasibleEstimate:
     """Return the feasible base parameters that explain the torques best (FBPE-OLS, eq. 74).
 
@@ -225,17 +225,19 @@ def constrained_least_squares(
         base: grouping of the parameters.
         conditions: the feasible set.
         prior: prior that the estimate is drawn to; None for none.
-        enough: tolerance of the objective that is enough to compare estimates, such as `ENOUGH`; all digits when None,
-            and with a prior.
+        first_tolerance: tolerance of the objective that is enough to compare estimates, such as `ENOUGH`; all digits
+            when None, and with a prior.
 
     Raises:
         ParameterError: shapes or names do not fit, or the prior is not one that a divergence can be measured from.
         ConditionsError: no parameters at all fulfil the conditions.
         SolverError: the solver stopped without an optimum.
     """
-    check(fit.beta, base, conditions)
+    require_consistent(fit.beta, base, conditions)
     if prior is None or prior.weight == 0.0:
-        found = nearest(fit.R1, fit.rho1, fit.beta, base, conditions, "constrained least squares", enough=enough)
+        found = nearest(
+            fit.R1, fit.rho1, fit.beta, base, conditions, "constrained least squares", first_tolerance=first_tolerance
+        )
         return _unless_feasible(found, fit.beta, base, conditions, OF_ESTIMATES[0])
     return solve_with_prior(fit, base, conditions, prior)
 

@@ -15,7 +15,7 @@ import numpy as np
 from ident_service.errors import ParameterError
 from ident_service.estimation.feasible.conic import triangle_entries
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
-from ident_service.estimation.feasible.formulation import EPSILON, LinkParameterMap, check
+from ident_service.estimation.feasible.formulation import EPSILON, LinkParameterMap, require_consistent
 from ident_service.estimation.least_squares import LeastSquares
 from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
@@ -37,7 +37,7 @@ def bpft_sdpa(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> str
     Raises:
         ParameterError: shapes or names do not fit.
     """
-    check(beta, base, conditions)
+    require_consistent(beta, base, conditions)
     lift = LinkParameterMap(base)
     names = ["t", *(base.names[column] for column in lift.dependent)]
     file = _File("BPFT, eq. 51, as a largest margin t", names, np.append(-1.0, np.zeros(len(lift.dependent))))
@@ -60,7 +60,7 @@ def bpfc_sdpa(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> str
     Raises:
         ParameterError: shapes or names do not fit.
     """
-    check(beta, base, conditions)
+    require_consistent(beta, base, conditions)
     return _nearest("BPFC, eq. 55", np.eye(base.size), beta, 0.0, base, conditions)
 
 
@@ -78,7 +78,7 @@ def fbpe_sdpa(fit: LeastSquares, base: BaseParameters, conditions: FeasibleSet) 
     Raises:
         ParameterError: shapes or names do not fit.
     """
-    check(fit.beta, base, conditions)
+    require_consistent(fit.beta, base, conditions)
     return _nearest("FBPE-OLS, eq. 74", fit.R1, fit.rho1, fit.rho2**2, base, conditions)
 
 

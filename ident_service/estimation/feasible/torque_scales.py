@@ -16,7 +16,12 @@ from ident_service.config.arm import ArmConfig
 from ident_service.errors import ParameterError
 from ident_service.estimation.feasible.conic import ConicProblem
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
-from ident_service.estimation.feasible.formulation import LinkParameterMap, active_constraints, check, insets
+from ident_service.estimation.feasible.formulation import (
+    LinkParameterMap,
+    active_constraints,
+    insets,
+    require_consistent,
+)
 from ident_service.estimation.feasible.nearest import FeasibleEstimate, add_conditions, solve_inside
 from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
@@ -76,7 +81,7 @@ def constrained_least_squares_with_scales(
         ConditionsError: no parameters at all fulfil the conditions.
         SolverError: the solver stopped without an optimum.
     """
-    check(np.zeros(information.base), base, conditions)
+    require_consistent(np.zeros(information.base), base, conditions)
     _check_bounds(bounds, information.joints)
     free = sorted(bounds)
     R = _stacked(information, free, np.ones(information.joints) if weights is None else weights)
@@ -90,7 +95,7 @@ def constrained_least_squares_with_scales(
 
 
 def feasible_with_factors(
-    R: Array, base: BaseParameters, conditions: FeasibleSet, guess: Array, bounds: tuple[Array, Array]
+    R: Array, base: BaseParameters, conditions: FeasibleSet, start_factors: Array, bounds: tuple[Array, Array]
 ) -> tuple[FeasibleEstimate, Array]:
     """Return the feasible base parameters and the bounded factors that minimise |R [beta; factors; 1]|.
 
@@ -99,7 +104,7 @@ def feasible_with_factors(
             factors + 1).
         base: grouping of the parameters.
         conditions: the feasible set.
-        guess: base parameters of the size that is to be expected, shape (base,).
+        start_factors: base parameters of the size that is to be expected, shape (base,).
         bounds: smallest and largest factors, shape (factors,) each.
 
     Raises:
@@ -121,14 +126,14 @@ def feasible_with_factors(
     to_delta = np.zeros((len(base.names), variables))
     to_delta[:, :n] = lift.of_beta
     to_delta[:, n : factors.start] = lift.of_dependent
-    add_conditions(problem, conditions, to_delta, insets(conditions, base, guess))
+    add_conditions(problem, conditions, to_delta, insets(conditions, base, start_factors))
     if free:
         pick = np.zeros((free, variables))
         pick[:, factors] = np.eye(free)
         problem.nonnegative(np.vstack([pick, -pick]), np.concatenate([-lower, upper]))
     objective = np.append(np.zeros(variables - 1), 1.0)
     name = "constrained least squares with torque scales"
-    size = float(np.max(np.abs(guess), initial=0.0))
+    size = float(np.max(np.abs(start_factors), initial=0.0))
     delta, solution = solve_inside(problem, objective, name, to_delta, conditions, size)
     beta = base.K @ delta
     residual = R @ np.concatenate([beta, solution.x[factors], [1.0]])
