@@ -27,7 +27,7 @@ from ident_service.excitation.trajectory import Path
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.capsule_distances import CapsuleModel
 from ident_service.model.collision import CollisionModel
-from ident_service.motion.stop_trajectory import stop
+from ident_service.motion.stop_trajectory import plan_stop
 from ident_service.motion.trajectory import Reference, Setpoint, run_to_end
 
 _BEGINS, _POINTS = 0.05, 8  # s between stops, points on each
@@ -117,7 +117,7 @@ def trajectory_stop_contact(
 ) -> Generator[None, None, str | None]:
     """Check sampled stops out of a trajectory by exact shapes, in slices; describe the first that touches, or None."""
     for time in np.arange(0.0, reference.duration, _BEGINS).tolist():
-        stopping = stop(reference.at(time), limits)
+        stopping = plan_stop(reference.at(time), limits)
         yield
         times = np.linspace(0.0, stopping.duration, _POINTS).tolist()
         for first in range(0, _POINTS, _AT_ONCE):
@@ -135,26 +135,26 @@ def _touches(what: str, time: float, pair: str | None, distance: float) -> str:
 
 
 def trajectory_clearance(
-    collision: CollisionModel, reference: Reference, limits: MotionLimits, least: float
+    collision: CollisionModel, reference: Reference, limits: MotionLimits, least_distance: float
 ) -> Clearance:
-    """Return the certified lower bound of a trajectory's distance to anything; proven if it is at least `least` [m]."""
+    """Return a certified lower bound of a trajectory's distance to anything; proven if at least `least_distance`."""
 
     def position(time: Vector) -> Vector:
         return np.array([reference.at(float(t)).position for t in time])
 
-    return certified_along(collision, position, limits.velocity, reference.duration, least)
+    return certified_along(collision, position, limits.velocity, reference.duration, least_distance)
 
 
-def motion_stop_clearance(path: Path, limits: MotionLimits, model: ArmModel) -> Nearest:
+def motion_stop_clearance(motion: Path, limits: MotionLimits, model: ArmModel) -> Nearest:
     """Return the smallest capsule distance in sampled stops out of a motion, its pair, and when the stop begins [s]."""
     capsules = CapsuleModel(model)
     nearest = Nearest(float("inf"), None, 0.0)
     if not capsules.pairs:
         return nearest
-    for begin, end in path.distinct:
+    for begin, end in motion.distinct:
         for time in np.arange(begin, end, _BEGINS):
-            position, velocity, acceleration, _ = path.at(float(time))
-            way = stop(Setpoint(position, velocity, acceleration), limits)
+            position, velocity, acceleration, _ = motion.at(float(time))
+            way = plan_stop(Setpoint(position, velocity, acceleration), limits)
             postures = np.array([way.at(share * way.duration).position for share in np.linspace(0.0, 1.0, _POINTS)])
             distances = capsules.distances(postures).min(axis=1)
             pair = int(distances.argmin())
@@ -163,20 +163,20 @@ def motion_stop_clearance(path: Path, limits: MotionLimits, model: ArmModel) -> 
     return nearest
 
 
-def motion_stop_contact(path: Path, limits: MotionLimits, model: ArmModel) -> str | None:
+def motion_stop_contact(motion: Path, limits: MotionLimits, model: ArmModel) -> str | None:
     """Describe the sampled stop out of a motion in which capsules around bodies overlap most; None if none touch."""
-    nearest = motion_stop_clearance(path, limits, model)
+    nearest = motion_stop_clearance(motion, limits, model)
     if nearest.distance > 0.0:
         return None
     return _touches("motion", nearest.time, nearest.pair, nearest.distance)
 
 
-def require_clear(model: ArmModel, path: Path, trajectories: Sequence[Reference], limits: MotionLimits) -> None:
+def require_clear(model: ArmModel, motion: Path, trajectories: Sequence[Reference], limits: MotionLimits) -> None:
     """Raise MotionRefused unless motion and trajectories provably keep clear and no sampled stop out of them touches.
 
     Args:
         model: model of the arm, with its geometry and surroundings; without any, nothing is checked.
-        path: the motion.
+        motion: the motion.
         trajectories: trajectories to the motion and back from it.
         limits: of the arm.
 
@@ -187,9 +187,9 @@ def require_clear(model: ArmModel, path: Path, trajectories: Sequence[Reference]
     if not collision.pairs:
         return
     least = model.config.workspace.clearance
-    _require_proven("the motion", certified_clearance(collision, path, least), least)
+    _require_proven("the motion", certified_clearance(collision, motion, least), least)
     require_clear_trajectories(model, [("the path to or from the motion", one) for one in trajectories], limits)
-    if touching := motion_stop_contact(path, limits, model):
+    if touching := motion_stop_contact(motion, limits, model):
         raise MotionRefused(touching)
 
 

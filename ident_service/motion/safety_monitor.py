@@ -38,7 +38,7 @@ def fault_from_events(events: Sequence[AxisEvent], names: Sequence[str], finding
     worst: Fault | None = None
     for event in events:
         whose = "" if event.axis is None else f"{names[event.axis]}: "
-        found = findings.found(event.code.value, f"{whose}{event.words}")
+        found = findings.count_fault(event.code.value, f"{whose}{event.words}")
         if worst is None or found.reaction > worst.reaction:
             worst = found
     return worst
@@ -128,12 +128,12 @@ class MonitoredSample:
     most_torque: Vector | None = None
 
 
-def checks(seen: MonitoredSample, limits: MotionLimits) -> Iterator[Check]:
+def checks(monitored: MonitoredSample, limits: MotionLimits) -> Iterator[Check]:
     """Yield all checks of a sample, each with a mask that may be empty; those for untrustworthy data come first."""
-    yield from _what_cannot_be_believed(seen, limits)
-    yield from _quick_stop_checks(seen)
-    yield from _what_must_end(seen, limits)
-    yield from _what_can_be_bridged(seen, limits)
+    yield from _what_cannot_be_believed(monitored, limits)
+    yield from _quick_stop_checks(monitored)
+    yield from _what_must_end(monitored, limits)
+    yield from _what_can_be_bridged(monitored, limits)
 
 
 def _what_cannot_be_believed(seen: MonitoredSample, limits: MotionLimits) -> Iterator[Check]:
@@ -348,18 +348,18 @@ class SafetyMonitor:
         """Return how often each warning was found, by code."""
         return self.findings.warnings
 
-    def feedback(
+    def check_feedback(
         self,
         sample: Sample,
         reference: Setpoint,
         velocity: Vector,
-        correction: Vector,
+        feedback_torque: Vector,
         feedback_acceleration: Vector | None = None,
         elapsed: float | None = None,
-        feedforward: Vector | float = 0.0,
+        friction_feedforward: Vector | float = 0.0,
         *,
-        known: bool = True,
-        unexplained: Vector | None = None,
+        elapsed_is_exact: bool = True,
+        unexplained_torque: Vector | None = None,
     ) -> tuple[Flags, Fault | None]:
         """Check a sample against all thresholds; return a mask of usable positions and the most severe fault or None.
 
@@ -367,15 +367,15 @@ class SafetyMonitor:
             sample: of this cycle.
             reference: setpoint at the sample's stamp.
             velocity: filtered velocity before this sample [rad/s or m/s], shape (joints,).
-            correction: feedback part of the torque before this sample [N m or N], shape (joints,).
+            feedback_torque: feedback part of the torque before this sample [N m or N], shape (joints,).
             feedback_acceleration: the acceleration in that torque [rad/s^2 or m/s^2], shape (joints,); without it,
                 `encoder_observer` is not updated.
             elapsed: time since the sample before [s]; one period when None.
-            known: whether `elapsed` is the true time; if not, it is the longest that it may be.
-            feedforward: friction in the torque before this sample [N m or N], shape (joints,), which pushes a joint
-                against its own friction as the correction does.
-            unexplained: torque that drives which are given positions measure beside the model's [N m or N], shape
-                (joints,), by which they push a joint on their own; None where none is known.
+            elapsed_is_exact: whether `elapsed` is the true time; if not, it is the longest that it may be.
+            friction_feedforward: friction in the torque before this sample [N m or N], shape (joints,), which pushes a
+                joint against its own friction as the feedback torque does.
+            unexplained_torque: torque that drives which are given positions measure beside the model's [N m or N],
+                shape (joints,), by which they push a joint on their own; None where none is known.
 
         Returns:
             Which axes' positions may be used, and the most severe fault found, if any.
@@ -383,13 +383,13 @@ class SafetyMonitor:
         self.findings.cycle += 1
         if self.findings.cycle == self._powered_by:
             self._was_powered, self._healthy = np.ones_like(self._was_powered), ()
-        self._elapsed, self._known = self._period if elapsed is None else elapsed, known
+        self._elapsed, self._known = self._period if elapsed is None else elapsed, elapsed_is_exact
         answered = all(sample.valid.tolist())
         encoders = self._encoders
         steps, valid = encoders.steps(sample.position, self._shown), encoders.valid(sample.valid)
-        pushed = np.abs(encoders.forces(correction + feedforward))
-        if unexplained is not None:
-            pushed = np.maximum(pushed, np.abs(encoders.forces(unexplained)))
+        pushed = np.abs(encoders.forces(feedback_torque + friction_feedforward))
+        if unexplained_torque is not None:
+            pushed = np.maximum(pushed, np.abs(encoders.forces(unexplained_torque)))
         self._count_stationary_cycles(steps, valid, pushed)
         same = (steps == 0.0) & valid
         if self._most_torque is not None:
@@ -400,7 +400,7 @@ class SafetyMonitor:
         if self._encoder_observer is not None and feedback_acceleration is not None:
             seen = np.where(valid, steps, 0.0)
             self._owes = self._encoder_observer.update(
-                seen, correction, feedback_acceleration, self._position, feedforward
+                seen, feedback_torque, feedback_acceleration, self._position, friction_feedforward
             )
         held = answered and self._all_fresh and self._quiet(sample.position, reference.position, velocity)
         if held and self._plain(sample):
@@ -411,7 +411,7 @@ class SafetyMonitor:
             with np.errstate(all="ignore"):
                 usable, fault = self._judged(sample, reference.position, velocity)
         if self._most_torque is not None:
-            pushes = self._count_pushes(self._none if unexplained is None else unexplained)
+            pushes = self._count_pushes(self._none if unexplained_torque is None else unexplained_torque)
             fault = pushes if pushes is not None and (fault is None or fault.reaction < pushes.reaction) else fault
         if sample.events:
             event = fault_from_events(sample.events, self._names, self.findings)
@@ -420,7 +420,7 @@ class SafetyMonitor:
                 fault = event
         return usable, fault
 
-    def torque(self, wanted: Vector) -> tuple[Vector, Fault | None]:
+    def limit_torque(self, wanted: Vector) -> tuple[Vector, Fault | None]:
         """Return the torque limited in size and rate (the first in size only; 0 if refused), and its fault or None.
 
         Args:
@@ -466,7 +466,7 @@ class SafetyMonitor:
         self._sent = leaves
         return leaves, fault
 
-    def position(self, wanted: Vector) -> tuple[Vector, Fault | None]:
+    def limit_position(self, wanted: Vector) -> tuple[Vector, Fault | None]:
         """Return the position limited in step for the drives (the last one if refused), and its fault or None.
 
         Args:
@@ -504,9 +504,9 @@ class SafetyMonitor:
         share = np.minimum(1.0, self.rate / np.maximum(change, self.rate))
         return np.asarray(before + np.where(self._joined, share, 1.0).min(axis=1) * (wanted - before))
 
-    def about(self, joint: int, what: str, velocity: float) -> str:
-        """Return a joint's name, a colon and `what`, whose `{}` becomes the velocity [rad/s or m/s] with its unit."""
-        return f"{self._names[joint]}: {what.format(f'{velocity:.4g} {self._units[joint]}/s')}"
+    def joint_message(self, joint_index: int, template: str, velocity: float) -> str:
+        """Return a joint's name, a colon and `template`, its `{}` replaced by the velocity [rad/s or m/s] with unit."""
+        return f"{self._names[joint_index]}: {template.format(f'{velocity:.4g} {self._units[joint_index]}/s')}"
 
     def _quiet(self, position: Vector, wanted: Vector, velocity: Vector) -> bool:
         """Return whether positions that all answered keep every position, velocity, following and jump threshold."""
@@ -647,4 +647,4 @@ class SafetyMonitor:
         return self._encoders.at_joints(flags)
 
     def _found(self, check: Check) -> Fault:
-        return self.findings.found(check.code, describe_check(check, self._names, self._units))
+        return self.findings.count_fault(check.code, describe_check(check, self._names, self._units))

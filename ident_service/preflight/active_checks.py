@@ -25,7 +25,15 @@ from ident_service.model.expected_friction import ExpectedFriction, expected_fri
 from ident_service.model.zero_phase import local_polynomial
 from ident_service.motion.clearance import trajectory_clearance
 from ident_service.motion.safety_monitor import TORQUE_RATE, TORQUE_RATE_SHARE
-from ident_service.motion.ticket import Check, Measure, Verdict, check_from_measures, failed, joint_units, measures
+from ident_service.motion.ticket import (
+    Check,
+    Measure,
+    Verdict,
+    check_from_measures,
+    failed_check,
+    joint_units,
+    measures,
+)
 from ident_service.motion.trajectory import Reference, RuckigReference, Setpoint, plan_trajectory, rest
 from ident_service.preflight.delay import CALM, FREQUENCY, Delay, delay_measures, dither
 from ident_service.preflight.session import BAND, CREEP, Rows, Session, Trace, remedy_of
@@ -270,7 +278,7 @@ def wrong_signs(trace: Trace, session: Session) -> list[int]:
 def sign_failure(joints: Sequence[int], model: ArmModel, why: str) -> Check:
     """Return the failed direction check of an arm with joints that went the wrong way."""
     names = ", ".join(model.chain.names[joint] for joint in joints)
-    return failed("direction", f"{names}: seems to move against its torque ({why})", SIGN_REMEDY)
+    return failed_check("direction", f"{names}: seems to move against its torque ({why})", SIGN_REMEDY)
 
 
 def direction_check(
@@ -440,7 +448,7 @@ def holdable(gravity: Vector, model: ArmModel, limits: MotionLimits) -> Check | 
     )
     if all(one.within_limits for one in found):
         return None
-    return failed(
+    return failed_check(
         "gravity",
         "holding the arm takes too much of the torque limits: "
         + "; ".join(str(one) for one in found if not one.within_limits),
@@ -510,7 +518,7 @@ def holding_fault_check(
     remedy, trace = remedy_of(error), session.trace()
     stands_still = error.code == "frozen_encoder"
     if remedy is not None and not stands_still:
-        return failed("gravity", str(error), remedy)
+        return failed_check("gravity", str(error), remedy)
     if not stands_still and (wrong := wrong_signs(trace, session)):
         return sign_failure(wrong, model, str(error))
     moved = trace.position[-1] - trace.position[0]
@@ -531,10 +539,10 @@ def holding_fault_check(
             )
             if abs(more) > most_more
         )
-        return failed("gravity", f"{weight}: {joints}; the safety monitor released it ({error.code})", REMEDY)
+        return failed_check("gravity", f"{weight}: {joints}; the safety monitor released it ({error.code})", REMEDY)
     if remedy is not None:
-        return failed("gravity", str(error), remedy)
-    return failed("gravity", f"the arm could not be held where it stands: {error}", f"{REMEDY} {_SIGNS}")
+        return failed_check("gravity", str(error), remedy)
+    return failed_check("gravity", f"the arm could not be held where it stands: {error}", f"{REMEDY} {_SIGNS}")
 
 
 def _weight(extra: Vector, gravity: Vector, most: Vector) -> str:

@@ -15,16 +15,16 @@ from drivers.axis_status import AxisStatus
 from ident_service.config.motion_limits import MotionLimits
 from ident_service.errors import AnotherDrive, ArmError, PositionUnknown, UnsuitableDrive
 from ident_service.model.arm_model import ArmModel
-from ident_service.motion.last_position import LOOK_AT_IT, LastPosition, turned
+from ident_service.motion.last_position import LOOK_AT_IT, LastPosition, whole_turns_text
 from ident_service.motion.ticket import (
     Check,
     Verdict,
     check_from_measures,
-    failed,
+    failed_check,
     joint_units,
     measure,
     measures,
-    skipped,
+    skipped_check,
 )
 from ident_service.preflight.session import ANSWERS_REMEDY, RATE_REMEDY, UNREACHABLE_REMEDY
 from ident_service.preflight.stability import delay_of
@@ -117,16 +117,16 @@ def identities_check(
     """
     code, names = "identities", model.chain.names
     if described.joint_names != names:
-        return failed(
+        return failed_check(
             code,
             f"the drives have the joints {', '.join(described.joint_names)}, the description {', '.join(names)}",
             "Give the description of this arm, or connect the arm that the description means.",
         )
     if wrong := [one for one in setup if not one.good]:
         remedies = dict.fromkeys(one.remedy for one in wrong if one.remedy)
-        return failed(code, "; ".join(map(str, wrong)), " ".join(remedies))
+        return failed_check(code, "; ".join(map(str, wrong)), " ".join(remedies))
     if too_long := long_silence(model, limits, described.watchdog):
-        return failed(code, too_long, LONG_SILENCE_REMEDY)
+        return failed_check(code, too_long, LONG_SILENCE_REMEDY)
     last = looked.samples[-1]
     stopped: dict[str, list[str]] = {}  # axes, by what their drives tell
     for name, state in zip(names, last.status, strict=False):
@@ -136,7 +136,7 @@ def identities_check(
     if stopped:
         todo = [remedy for flag, remedy in STOPPED.items() if any(AxisStatus(word) & flag for word in last.status)]
         reason = "; ".join(f"{', '.join(axes)}: {told}" for told, axes in stopped.items())
-        return failed(code, reason, " ".join(todo))
+        return failed_check(code, reason, " ".join(todo))
     answers = np.array([sample.valid & np.isfinite(sample.position) for sample in looked.samples])
     nothing = np.zeros(len(names))
     found = [
@@ -180,7 +180,9 @@ def at_rest_check(
     """
     code, names = "at_rest", model.chain.names
     if not looked.usable:
-        return failed(code, "not every axis answers as it should", "Check bus and encoders of the axes named above.")
+        return failed_check(
+            code, "not every axis answers as it should", "Check bus and encoders of the axes named above."
+        )
     position = looked.position
     drift = np.abs(position[-1] - position[0]) / (looked.period * (len(position) - 1))
     speed = joint_units(model.chain.revolute, "rad/s", "m/s")
@@ -191,8 +193,8 @@ def at_rest_check(
     ]
     if closed is not None:
         found += measures("moved since it was closed last", position[-1] - closed.position, angle, names)
-        if words := turned(closed, position[-1], model.config):
-            return failed(code, words, LOOK_AT_IT, found)
+        if words := whole_turns_text(closed, position[-1], model.config):
+            return failed_check(code, words, LOOK_AT_IT, found)
     return check_from_measures(
         code, found, "Let the arm come to rest on its support, inside its position limits, and keep hands off."
     )
@@ -207,7 +209,7 @@ def rate_check(looked: IdleRecording, lock_step: bool) -> Check:
     """
     code = "rate"
     if lock_step:
-        return skipped(code, "time is virtual, so there is no lateness to measure")
+        return skipped_check(code, "time is virtual, so there is no lateness to measure")
     period = looked.period
     gaps = np.diff(looked.woken_ns) * 1e-9
     late = np.maximum(gaps - period, 0.0)
@@ -261,7 +263,7 @@ def noise_check(
         mass: the model's mass matrix where the arm stands, shape (joints, joints).
     """
     if not looked.usable:
-        return failed("noise", "not every axis answers as it should", "Check bus and encoders.")
+        return failed_check("noise", "not every axis answers as it should", "Check bus and encoders.")
     names, period = model.chain.names, looked.period
     position = looked.position
     time = np.linspace(-1.0, 1.0, len(position))[:, None]

@@ -35,9 +35,9 @@ from ident_service.motion.ticket import (
     Check,
     Ticket,
     Verdict,
-    failed,
+    failed_check,
     new_ticket,
-    skipped,
+    skipped_check,
     subject_of,
 )
 from ident_service.motion.trajectory import hold, rest
@@ -227,8 +227,8 @@ class _Preflight:
         why = why if because is None else f"because {because} failed"
         made = dict(self.checks)
         if self.excitation is None:
-            made |= {code: skipped(code, "no motion was given") for code in ("motion_fits", "motion_proven")}
-        return [made.get(code) or skipped(code, why) for code in CODES]
+            made |= {code: skipped_check(code, "no motion was given") for code in ("motion_fits", "motion_proven")}
+        return [made.get(code) or skipped_check(code, why) for code in CODES]
 
     def _opened(self, limits: MotionLimits) -> None:
         self.described = self.arm.describe()
@@ -294,7 +294,7 @@ class _Preflight:
             return strokes(session, self.model, room)
         except (ModelError, MotionRefused) as error:
             remedy = "Move the arm by hand to where every joint has room."
-            self._passed(failed("direction", str(error), remedy), of_place=True)
+            self._passed(failed_check("direction", str(error), remedy), of_place=True)
             return []
 
     def _touched(self, session: Session, planned: Sequence[TestMotion], gravity: _Gravity) -> None:
@@ -343,7 +343,7 @@ class _Preflight:
                 if at_rest_check(looked, self.model, recoverable_limits(limits)).verdict is Verdict.PASSED:
                     break
             else:
-                return failed(CODE, "the arm does not come to rest after its drives stopped", REST_REMEDY)
+                return failed_check(CODE, "the arm does not come to rest after its drives stopped", REST_REMEDY)
             home = looked.samples[-1].position
             if any(AxisStatus(word) & AxisStatus.FAULT for word in looked.samples[-1].status):
                 self.arm.reset()  # the host's own silence was the fault
@@ -362,7 +362,7 @@ class _Preflight:
                 self._end_own_fault()
         except (MotionRefused, ArmFault) as error:
             self.arm.stop(StopKind.TORQUE_OFF)
-            return failed(CODE, f"in motion: {error}", REST_REMEDY, at_rest.measures)
+            return failed_check(CODE, f"in motion: {error}", REST_REMEDY, at_rest.measures)
         return replace(moving, measures=(*at_rest.measures, *moving.measures))
 
     def _end_own_fault(self) -> None:
@@ -424,7 +424,7 @@ class _Preflight:
             self._passed(holding_fault_check(session, self.model, gravity.limits, gravity.friction, error))
             return
         if (remedy := remedy_of(error)) is not None:
-            self._passed(failed("direction", str(error), remedy))
+            self._passed(failed_check("direction", str(error), remedy))
             return
         trace = session.trace()
         astray = int(np.argmax(np.abs(trace.position[-1] - trace.reference[-1])))
@@ -436,10 +436,10 @@ class _Preflight:
             self._passed(sign_failure([astray], self.model, str(error)))
         elif warned or swinging:
             reason = str(error) if warned else f"{name} swings about its path: {error}"
-            self._passed(failed("direction", reason, SHAKEN_REMEDY))
+            self._passed(failed_check("direction", reason, SHAKEN_REMEDY))
         else:
             remedy = f"Free {name} if something blocks it or a brake holds it; check its encoder and its signs."
-            self._passed(failed("direction", f"{name} left the path: {error}", remedy))
+            self._passed(failed_check("direction", f"{name} left the path: {error}", remedy))
 
     def _broken(self, error: ArmError) -> None:
         """Record a failed check for an arm that could not be opened, recorded or energised, or that fell silent."""
@@ -450,7 +450,7 @@ class _Preflight:
             left = (code for code in CODES if code not in self.checks and code not in ABOUT_THE_MOTION)
             code = next(left, CODES[-1])
             remedy = "Do this, then check again." if isinstance(error, ActionNeeded) else BROKEN_REMEDY
-            self._passed(failed(code, str(error), remedy))
+            self._passed(failed_check(code, str(error), remedy))
 
     def _left_behind(self, words: str) -> None:
         """Record which drives have not confirmed that they are off, with what failed last of the arm's own checks.
@@ -463,7 +463,7 @@ class _Preflight:
             self._passed(replace(bad[-1], reason=f"{bad[-1].reason}; {words}"))
         else:
             last = self.checks.get(CODES[-1])
-            self._passed(failed(CODES[-1], words, CLOSING_REMEDY, () if last is None else last.measures))
+            self._passed(failed_check(CODES[-1], words, CLOSING_REMEDY, () if last is None else last.measures))
 
     def _passed(self, check: Check, *, of_place: bool = False) -> bool:
         if of_place and check.verdict is Verdict.FAILED and self.away:

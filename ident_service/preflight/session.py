@@ -412,14 +412,14 @@ class Session:
         velocity, correction = (np.where(given_up, 0.0, of) for of in (control.velocity, self._correction))
         known = self._since.known
         pushes = sample.torque - self._explained if self._explained is not None else np.zeros_like(velocity)
-        usable, fault = self._guard.feedback(
+        usable, fault = self._guard.check_feedback(
             sample,
             setpoint,
             velocity,
             correction,
             elapsed=since,
-            known=known,
-            unexplained=np.where(given_up, 0.0, pushes),
+            elapsed_is_exact=known,
+            unexplained_torque=np.where(given_up, 0.0, pushes),
         )
         if fault is not None and fault.reaction is not Reaction.WARN:
             raise ArmFault(fault.code, fault.message, [row[0] for row in self._rows[-100:]])
@@ -443,7 +443,7 @@ class Session:
 
     def _passed(self, wanted: Vector) -> Vector:
         """Return the position that the guard lets pass [rad or m], shape (joints,)."""
-        position, fault = self._guard.position(wanted)
+        position, fault = self._guard.limit_position(wanted)
         if fault is not None and fault.reaction is not Reaction.WARN:
             raise ArmFault(fault.code, fault.message, [row[0] for row in self._rows[-100:]])
         return position
@@ -451,7 +451,7 @@ class Session:
     def _limited(self, wanted: Vector, *, band: bool = True) -> Vector:
         if band:
             wanted = np.clip(wanted, self.gravity - self._band, self.gravity + self._band)
-        torque, fault = self._guard.torque(wanted)
+        torque, fault = self._guard.limit_torque(wanted)
         if fault is not None and fault.reaction is not Reaction.WARN:
             raise ArmFault(fault.code, fault.message, [row[0] for row in self._rows[-100:]])
         return torque

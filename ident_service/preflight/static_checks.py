@@ -23,11 +23,11 @@ from ident_service.motion.ticket import (
     Measure,
     Verdict,
     check_from_measures,
-    failed,
+    failed_check,
     joint_units,
     measure,
     measures,
-    skipped,
+    skipped_check,
 )
 from ident_service.motion.trajectory import PathReference, Reference, plan_trajectory, rest
 from ident_service.preflight.stability import INERTIA, LEAST_GAIN_MARGIN, delay_of, stability
@@ -64,17 +64,17 @@ def configuration_check(model: ArmModel, load: Budget | None = None) -> Check:
         after_stop(model, limits)
         smallest = float(np.linalg.eigvalsh(dynamics.mass_matrix(limits.home)).min())
     except IdentError as error:
-        return failed(code, str(error), remedy)
+        return failed_check(code, str(error), remedy)
     if not smallest > 0.0:
-        return failed(
+        return failed_check(
             code,
             "the prior's mass matrix at home is not positive definite: no real body has these parameters",
             "Give prior parameters of a feasible identification or of a CAD model.",
         )
     if too_long := long_silence(model, limits, model.config.watchdog):
-        return failed(code, too_long, LONG_SILENCE_REMEDY)
+        return failed_check(code, too_long, LONG_SILENCE_REMEDY)
     if load is not None and not load.fits:
-        return failed(code, load.reason, load.remedy)
+        return failed_check(code, load.reason, load.remedy)
     return Check(code, Verdict.PASSED)
 
 
@@ -102,9 +102,11 @@ def motion_fits_check(model: ArmModel, excitation: Excitation) -> Check:
     """Return the check `motion_fits`: passed if the motion was made for this description (`motion_sha256`)."""
     code, remedy = "motion_fits", "Design the motion again for the description as it is now."
     if excitation.arm_sha256 != model.config.motion_sha256:
-        return failed(code, f"the {excitation.name} motion was made for another description of the arm", remedy)
+        return failed_check(code, f"the {excitation.name} motion was made for another description of the arm", remedy)
     if excitation.path.joints != model.chain.joints:
-        return failed(code, f"a motion of {excitation.path.joints} joints for an arm of {model.chain.joints}", remedy)
+        return failed_check(
+            code, f"a motion of {excitation.path.joints} joints for an arm of {model.chain.joints}", remedy
+        )
     return Check(code, Verdict.PASSED)
 
 
@@ -119,7 +121,7 @@ def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excit
         found = violations(proof, model, limits)
         nearest = motion_stop_clearance(excitation.path, limits, model)
     except (ModelError, MotionRefused) as error:
-        return failed(code, str(error), remedy)
+        return failed_check(code, str(error), remedy)
     try:
         require_stops_within_limits(excitation.path, limits, model.chain.names)
     except MotionRefused as error:
@@ -140,7 +142,7 @@ def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excit
         taken.append(measure("clearance of stops", nearest.distance, "m", least=0.0))
         if nearest.distance <= 0.0:
             found.append(f"a stop out of the motion at {nearest.time:.2f} s would touch: {nearest.pair}")
-    return failed(code, "; ".join(found), remedy, taken) if found else check_from_measures(code, taken, remedy)
+    return failed_check(code, "; ".join(found), remedy, taken) if found else check_from_measures(code, taken, remedy)
 
 
 def point_speeds(model: ArmModel, position: Vector, seconds: Vector, what: str) -> list[Measure]:
@@ -174,7 +176,7 @@ def stability_check(model: ArmModel, limits: MotionLimits, excitation: Excitatio
     Drives that are given positions close the loop by themselves, with gains of their maker's tool.
     """
     if getattr(model.config.driver, "streams", "torque") == "position":
-        return skipped("stability", "the drives close the position loop by themselves (driver.streams: position)")
+        return skipped_check("stability", "the drives close the position loop by themselves (driver.streams: position)")
     path = None if excitation is None or excitation.path.joints != model.chain.joints else excitation.path
     postures = np.vstack([limits.home, 0.5 * (limits.lower + limits.upper)])
     if path is not None:
@@ -223,7 +225,7 @@ def path_home_check(model: ArmModel, limits: MotionLimits, position: Vector) -> 
     try:
         ((_, leg),) = PointToPointPlan(Destination.HOME).legs(model, position, limits)
     except (ModelError, MotionRefused) as error:
-        return failed(code, str(error), "Move the arm by hand to where the straight path home is free.")
+        return failed_check(code, str(error), "Move the arm by hand to where the straight path home is free.")
     found = [measure("the way home, length", leg.duration, "s"), *_leg_speeds(model, leg, "on the way home")]
     return check_from_measures(code, found, _SLOWER)
 
@@ -254,5 +256,7 @@ def paths_check(model: ArmModel, limits: MotionLimits, excitation: Excitation, p
                 clearance = trajectory_clearance(collision, leg, limits, least)
                 found.append(measure(f"{what}, clearance", clearance.lower_bound, "m", least=least))
     except (ModelError, MotionRefused) as error:
-        return failed(code, str(error), "Move the arm by hand to where motions begin (home), then check again.", found)
+        return failed_check(
+            code, str(error), "Move the arm by hand to where motions begin (home), then check again.", found
+        )
     return check_from_measures(code, found, "Move the arm by hand to where motions begin (home), then check again.")

@@ -17,7 +17,7 @@ from drivers.axis_status import AxisStatus
 from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import ArmFault
 from ident_service.model.arm_model import ArmModel
-from ident_service.motion.ticket import Check, Verdict, check_from_measures, failed, measure
+from ident_service.motion.ticket import Check, Verdict, check_from_measures, failed_check, measure
 from ident_service.motion.trajectory import Setpoint
 from ident_service.preflight.session import REMEDIES, Session
 from ident_service.preflight.static_checks import LONGEST_SILENCE, long_silence
@@ -57,7 +57,7 @@ def consent_check(model: ArmModel, sample: Sample, confirm: Confirm) -> Check | 
     if not sample.status:
         why = "the driver does not report drive states, so the watchdogs cannot be tested"
         remedy = "Nothing moves without this proof: have the driver report the state of each drive in `Sample.status`."
-        return failed(CODE, why, remedy)
+        return failed_check(CODE, why, remedy)
     name = model.config.name
     typed = confirm(
         "Now the arm gets torque: it is held where it stands, and every joint moves a little. At the end the drives' "
@@ -122,7 +122,7 @@ def watchdog_check(
                     if not at.size:
                         begun, at = sample.stamp_ns, sample.position
                         if not all(word & AxisStatus.POWERED for word in status):
-                            return failed(CODE, "the drives do not report that they have power", REMEDY)
+                            return failed_check(CODE, "the drives do not report that they have power", REMEDY)
                 silent = (sample.stamp_ns - begin_ns) * 1e-9
                 for number, word in enumerate(status):
                     if word & AxisStatus.EMERGENCY_STOP:
@@ -150,7 +150,7 @@ def watchdog_check(
         travel = _travel(arm, at, moving) if moving is not None else None
     except ArmFault as ended:
         why = f"{where}, while drives missed {_WORDS[kind]} and before all had said that they stopped: {ended}"
-        return failed(CODE, f"{why}; the arm was released", REMEDY)
+        return failed_check(CODE, f"{why}; the arm was released", REMEDY)
     finally:
         arm.stop(StopKind.TORQUE_OFF)
     found = []
@@ -172,8 +172,10 @@ def watchdog_check(
         found.append(measure("in motion, distance until at rest", travel, unit, joint=name))
         if travel == 0.0 and not strange:
             why = f"{name}: position unchanged to the last bit from the middle of a motion until at rest"
-            return failed(CODE, why, REMEDIES["frozen_encoder"], found)
-    return failed(CODE, "; ".join(strange), REMEDY, found) if strange else check_from_measures(CODE, found, REMEDY)
+            return failed_check(CODE, why, REMEDIES["frozen_encoder"], found)
+    return (
+        failed_check(CODE, "; ".join(strange), REMEDY, found) if strange else check_from_measures(CODE, found, REMEDY)
+    )
 
 
 def _most(dog: Watchdog, period: float, delay: float) -> float:

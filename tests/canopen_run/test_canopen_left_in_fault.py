@@ -82,7 +82,9 @@ def behind(config: ArmConfig) -> Iterator[LockStepArm]:
 def moved(config: ArmConfig, latch: ActiveFaults) -> State:
     model = arm_model(config)
     with make_arm(config) as arm:
-        state = run(arm, model, excitation(model, "identification"), Story(), latch=latch, hold_seconds=0.1).state
+        state = run(
+            arm, model, excitation(model, "identification"), Story(), active_faults=latch, hold_seconds=0.1
+        ).state
     assert arm.unconfirmed() == ()
     return state
 

@@ -71,7 +71,7 @@ def test_a_run_is_refused_before_anything_is_energised_and_its_recording_says_wh
     model = arm_model(described)
     with opened(described, build) as (arm, _):
         with pytest.raises(DriverError, match=SAID) as refused:
-            run(arm, model, excitation(model, "identification"), story, latch=latch)
+            run(arm, model, excitation(model, "identification"), story, active_faults=latch)
         assert "Check termination, connectors, cable and bit rate of every node on bench" in str(refused.value)
         assert not any(word & 1 for word in arm.exchange(None).status)
     assert story.samples == []

@@ -47,7 +47,7 @@ def test_motors_are_weaker_together_than_joints_alone() -> None:
 @settings(max_examples=100)
 @given(WANTED)
 def test_the_first_torque_is_scaled_as_a_whole(wanted: Array) -> None:
-    leaves, fault = guard().torque(wanted)
+    leaves, fault = guard().limit_torque(wanted)
     within = np.clip(wanted, -LIMITS.torque, LIMITS.torque)
     share = min(1.0, *(np.array(MOST) / np.maximum(np.abs(motors(within)), 1e-12)))
     np.testing.assert_allclose(leaves, share * within, rtol=1e-9, atol=1e-12)
@@ -79,7 +79,7 @@ def test_what_is_wanted_for_long_is_reached() -> None:
 
 
 def test_the_sentence_names_the_motor() -> None:
-    _, fault = guard().torque(np.array([20.0, 14.0]))
+    _, fault = guard().limit_torque(np.array([20.0, 14.0]))
     assert fault is not None
     assert fault.code == "torque_saturated"
     wanted = motors(np.array([20.0, 14.0]))

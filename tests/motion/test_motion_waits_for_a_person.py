@@ -48,7 +48,7 @@ def moved(times: int, way: float, controls: Any = None, config: ArmConfig | None
     with LedArm(config, times, way) as arm:
         before = arm.exchange(None).position
         try:
-            report = run(arm, model, excitation(model, "identification"), story, controls, latch=latch)
+            report = run(arm, model, excitation(model, "identification"), story, controls, active_faults=latch)
         except (MotionRefused, ArmFault) as refused:
             return refused, story, latch
         finally:
@@ -144,7 +144,7 @@ def test_an_emergency_stop_that_is_pressed_while_a_person_is_waited_for_is_latch
         PressedArm(config, 0, 0.0) as arm,
         pytest.raises(ArmFault, match="release it, then press Shift-Idle") as stopped,
     ):
-        run(arm, model, excitation(model, "identification"), story, latch=latch)
+        run(arm, model, excitation(model, "identification"), story, active_faults=latch)
     assert stopped.value.code == "emergency_stop"
     assert [(fault.code, fault.cause) for fault in latch.faults] == [
         ("emergency_stop", "the emergency stop is pressed, or has been: release it, then press Shift-Idle")

@@ -40,7 +40,7 @@ def checked(flight: Flight, arm: Arm, motion: Excitation | None) -> Ticket:
 
 def for_a_way_home(ticket: Ticket) -> list[str]:
     """Why it does not allow the path home on the same arm."""
-    return ticket.valid_for(replace(ticket.subject, excitation="", excitation_sha256=""), ticket.created)
+    return ticket.objections_to(replace(ticket.subject, excitation="", excitation_sha256=""), ticket.created)
 
 
 @pytest.mark.parametrize("ends", [bus_goes, stopped])

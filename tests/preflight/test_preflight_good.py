@@ -111,7 +111,7 @@ def test_a_driver_that_does_not_tell_about_its_drives_gets_no_ticket_and_nobody_
     assert "Sample.status" in check.remedy
     assert flight.questions == []
     assert "enable" not in flight.arm.calls
-    assert ticket.valid_for(ticket.subject, ticket.created) == ["checks failed: watchdog"]
+    assert ticket.objections_to(ticket.subject, ticket.created) == ["checks failed: watchdog"]
 
 
 def test_the_ticket_is_stamped_by_the_clock_it_is_given(good: Flown) -> None:
