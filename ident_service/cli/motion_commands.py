@@ -540,10 +540,10 @@ def _check(arguments: argparse.Namespace) -> Answer:
                 model,
                 motion,
                 confirm=partial(typed, arguments),
-                tell=lambda check: step(*_PREFLIGHT.get(check.code, ("checking", None))),
-                rate_seconds=seconds,
-                closed=closed,
-                announce=lambda action: tell(arguments, f"{config.name}: {action}"),
+                on_check=lambda check: step(*_PREFLIGHT.get(check.code, ("checking", None))),
+                holding_seconds=seconds,
+                last_position=closed,
+                tell_operator=lambda action: tell(arguments, f"{config.name}: {action}"),
             )
         if any(one.code == "at_rest" and one.verdict is Verdict.PASSED for one in ticket.checks):
             positions.keep(arm)

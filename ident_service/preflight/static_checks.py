@@ -48,12 +48,12 @@ _POSTURES = 8  # of the motion, at which the coupled loop is judged
 
 
 @unhurried()
-def configuration_check(model: ArmModel, load: Budget | None = None) -> Check:
+def configuration_check(model: ArmModel, bus_budget: Budget | None = None) -> Check:
     """Return the check `configuration`: limits, gains, feasible prior, secured stop, short watchdogs, room on the bus.
 
     Args:
         model: of the arm.
-        load: load of the arm's buses; None for an arm on none.
+        bus_budget: load of the arm's buses; None for an arm on none.
     """
     code, remedy = "configuration", "Complete the arm's description; `ident config check` names every place."
     try:
@@ -71,14 +71,14 @@ def configuration_check(model: ArmModel, load: Budget | None = None) -> Check:
             "the prior's mass matrix at home is not positive definite: no real body has these parameters",
             "Give prior parameters of a feasible identification or of a CAD model.",
         )
-    if too_long := long_silence(model, limits, model.config.watchdog):
+    if too_long := long_silence_text(model, limits, model.config.watchdog):
         return failed_check(code, too_long, LONG_SILENCE_REMEDY)
-    if load is not None and not load.fits:
-        return failed_check(code, load.reason, load.remedy)
+    if bus_budget is not None and not bus_budget.fits:
+        return failed_check(code, bus_budget.reason, bus_budget.remedy)
     return Check(code, Verdict.PASSED)
 
 
-def long_silence(model: ArmModel, limits: MotionLimits, seconds: float | None) -> str:
+def long_silence_text(model: ArmModel, limits: MotionLimits, watchdog_seconds: float | None) -> str:
     """Return a sentence if drives act on too long without host and joints can fall; empty if not, or not known.
 
     It is empty, too, where the description says why that is safe (`watchdog_reason`).
@@ -86,14 +86,14 @@ def long_silence(model: ArmModel, limits: MotionLimits, seconds: float | None) -
     Args:
         model: model of the arm, with a prior.
         limits: of the arm.
-        seconds: time after which the drives give up torque [s]; None where unknown.
+        watchdog_seconds: time after which the drives give up torque [s]; None where unknown.
     """
-    if seconds is None or seconds <= LONGEST_SILENCE or model.config.watchdog_reason:
+    if watchdog_seconds is None or watchdog_seconds <= LONGEST_SILENCE or model.config.watchdog_reason:
         return ""
     if not (falling := joints_with_weight(model, limits)):
         return ""
     return (
-        f"drives go on for {seconds:g} s when the host is gone, and {', '.join(falling)} can fall: at most "
+        f"drives go on for {watchdog_seconds:g} s when the host is gone, and {', '.join(falling)} can fall: at most "
         f"{LONGEST_SILENCE:g} s"
     )
 
@@ -133,7 +133,7 @@ def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excit
             share = peak / getattr(limits, key)
             taken += measures(f"{key}, share of the limit", share, ("",) * len(names), names, most=np.ones(len(names)))
     seconds = np.linspace(0.0, excitation.path.duration, _SPEEDS)
-    taken += point_speeds(model, excitation.path.at(seconds)[0], seconds, "of the motion")
+    taken += point_speed_measures(model, excitation.path.at(seconds)[0], seconds, "of the motion")
     least = model.config.workspace.clearance
     for what, clearance in (("clearance", proof.clearance), ("clearance on the way from home", proof.approach)):
         if clearance is not None and clearance.pair is not None:
@@ -145,28 +145,28 @@ def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excit
     return failed_check(code, "; ".join(found), remedy, taken) if found else check_from_measures(code, taken, remedy)
 
 
-def point_speeds(model: ArmModel, position: Vector, seconds: Vector, what: str) -> list[Measure]:
+def point_speed_measures(model: ArmModel, positions: Vector, sample_times: Vector, name_suffix: str) -> list[Measure]:
     """Return a list of one measure, the fastest frame's speed [m/s] with its limit; empty where none is described.
 
     Args:
         model: of the arm.
-        position: along a motion [rad or m], shape (samples, joints).
-        seconds: of the samples [s], shape (samples,).
-        what: suffix of the measure's name.
+        positions: along a motion [rad or m], shape (samples, joints).
+        sample_times: of the samples [s], shape (samples,).
+        name_suffix: suffix of the measure's name.
     """
     limit = model.config.point_speed_limit
     if limit is None:
         return []
-    steps = np.diff(frame_origins(model.chain, position), axis=0) / np.diff(seconds)[:, None, None]
+    steps = np.diff(frame_origins(model.chain, positions), axis=0) / np.diff(sample_times)[:, None, None]
     fastest = float(np.linalg.norm(steps, axis=2).max())
-    return [measure(f"speed of elbow and tip {what} (driver.limits.velocity)", fastest, "m/s", most=limit)]
+    return [measure(f"speed of elbow and tip {name_suffix} (driver.limits.velocity)", fastest, "m/s", most=limit)]
 
 
 def _leg_speeds(model: ArmModel, leg: Reference, what: str) -> list[Measure]:
     seconds = np.linspace(0.0, leg.duration, _LEG_SPEEDS)
     if model.config.point_speed_limit is None or not leg.duration > 0.0:
         return []
-    return point_speeds(model, np.array([leg.at(float(time)).position for time in seconds]), seconds, what)
+    return point_speed_measures(model, np.array([leg.at(float(time)).position for time in seconds]), seconds, what)
 
 
 @unhurried()

@@ -83,7 +83,7 @@ def test_a_run_is_refused_before_anything_is_energised_and_its_recording_says_wh
 def test_preflight_says_so_before_a_person_is_asked_for_anything(build: Build, config: Callable[[], ArmConfig]) -> None:
     described, asked = config(), list[str]()
     arm, _ = passive_bus(described, build)
-    ticket = preflight(arm, arm_model(described), None, confirm=lambda text: asked.append(text) or "", look_seconds=0.2)
+    ticket = preflight(arm, arm_model(described), None, confirm=lambda text: asked.append(text) or "", idle_seconds=0.2)
     (check,) = [one for one in ticket.checks if one.verdict is Verdict.FAILED]
     assert (check.code, check.reason) == ("identities", SAID)
     assert check.remedy.startswith("Check termination")

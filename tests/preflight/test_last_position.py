@@ -105,7 +105,7 @@ def test_the_position_is_kept_after_the_arm_was_closed_and_compared_when_it_is_o
 def checks(behind: LockStepArm, config: ArmConfig, closed: LastPosition | None) -> dict[str, Check]:
     """What preflight says up to where it would hold the arm, which nobody confirms."""
     arm = opened_by(behind, config)
-    ticket = preflight(arm, arm_model(config), None, look_seconds=0.2, closed=closed)
+    ticket = preflight(arm, arm_model(config), None, idle_seconds=0.2, last_position=closed)
     return {check.code: check for check in ticket.checks}
 
 
