@@ -34,7 +34,7 @@ from drivers.arm import (
 from drivers.axis_status import AxisEvent, AxisEventCode, AxisStatus
 from drivers.barrett import setup
 from drivers.barrett.cycle import MotorPuck, PuckBus, PuckCodec, axis_status, budget
-from drivers.barrett.protocol import POSITION_BITS, Group, Mode, Properties, SafetyMode, Status, get, put
+from drivers.barrett.protocol import POSITION_BITS, Group, Mode, Properties, SafetyMode, Status, get_frame, set_frame
 from drivers.can.bus_load import Budget
 from drivers.can.bus_state import BUS_EVENTS, HOST, Event, EventCode, controller_checks
 from drivers.can.can_link import Link, open_links
@@ -236,9 +236,9 @@ class BarrettArm(Arm):
             raise DriverError(f"{self._config.name}: zeroing needs the home of every joint")
         port = self._open_port()
         try:
-            found = setup.found_on(port, self._driver)
+            found = setup.read_pucks(port, self._driver)
             self._require_reachable(found)
-            return setup.zero(port, found, self._coordinates, home)
+            return setup.write_home(port, found, self._coordinates, home)
         finally:
             self.close()
 
@@ -263,14 +263,14 @@ class BarrettArm(Arm):
         self._reset_state()
         try:
             port = self._open_port()
-            found = setup.found_on(port, self._driver, wakes=not self._looks)
+            found = setup.read_pucks(port, self._driver, wakes=not self._looks)
             self._found = found
             self._checks = setup.checks(found)
             self._require_reachable(found)
             if not self._looks:
-                for frame in setup.lowering(found):
+                for frame in setup.idle_frames(found):
                     port.link.send(frame)
-                setup.limit(port, found, self._driver)
+                setup.write_safety_limits(port, found, self._driver)
             if not setup.is_zeroed(port, found):
                 raise PositionUnknown(
                     f"{self._config.name} has not been zeroed since its pucks have power (ZERO is 0): lead it home by "
@@ -367,7 +367,7 @@ class BarrettArm(Arm):
         stat = setup.PropertyPort(bus.link)
         for puck in bus.codec.pucks:
             if puck.stat == Status.ERROR and self._found is not None:
-                stat.link.send(put(puck.node, self._found.motors.number("STAT"), Status.READY))
+                stat.link.send(set_frame(puck.node, self._found.motors.number("STAT"), Status.READY))
         until_ns = self.clock.now_ns() + round(_RESET * 1e9)
         while any(puck.stat == Status.ERROR for puck in bus.codec.pucks) and self.clock.now_ns() < until_ns:
             bus.cycle(None)
@@ -460,10 +460,10 @@ class BarrettArm(Arm):
     @staticmethod
     def _ask_whether_idle(bus: PuckBus, motors: Properties) -> None:
         """Ask all pucks for MODE, and those that have not said IDLE for STAT: one that has restarted knows no MODE."""
-        bus.link.send(get(Group.ARM, motors.number("MODE"), group=True))
+        bus.link.send(get_frame(Group.ARM, motors.number("MODE"), group=True))
         for puck in bus.codec.pucks:
             if puck.mode == Mode.TORQUE:
-                bus.link.send(get(puck.node, motors.number("STAT")))
+                bus.link.send(get_frame(puck.node, motors.number("STAT")))
 
     _port: setup.PropertyPort | None = None
 
@@ -533,7 +533,7 @@ class BarrettArm(Arm):
             bus.cycle(zero, asks_safety=True)
             self._require_sound()
         if self._found is not None:
-            bus.link.send(get(Group.ARM, self._found.motors.number("MODE"), group=True))
+            bus.link.send(get_frame(Group.ARM, self._found.motors.number("MODE"), group=True))
         for _ in range(max(_FAREWELL, round(_RAISED / period))):
             if all(status & AxisStatus.POWERED for status in self.drive_status()):
                 return
@@ -570,14 +570,14 @@ class BarrettArm(Arm):
     def _lower(self, bus: PuckBus) -> None:
         """Send IDLE to everybody, every frame on its own; never raises."""
         self._untold = False
-        for frame in () if self._found is None else setup.lowering(self._found):
+        for frame in () if self._found is None else setup.idle_frames(self._found):
             try:
                 bus.link.send(frame)
             except Exception:  # noqa: BLE001 - whatever the link died of, it is tried again
                 self._untold = True
 
     def _require_reachable(self, found: setup.FoundArm) -> None:
-        if lost := setup.unreachable(found):
+        if lost := setup.nodes_without_group(found):
             wrong = [str(one) for one in setup.checks(found) if not one.good]
             nodes = ", ".join(map(str, lost))
             raise DriverError(f"no group frame reaches pucks {nodes}: {'; '.join(wrong)}")

@@ -101,12 +101,12 @@ class AnsweringNode(Protocol):
     order: AnswerOrder
 
 
-def settle_uncertain(nodes: Iterable[AnsweringNode], tell: Callable[[EventCode, int, str], None]) -> int:
+def settle_uncertain(nodes: Iterable[AnsweringNode], on_late: Callable[[EventCode, int, str], None]) -> int:
     """Count uncertain answers at a cycle's end as the latest request's, or late; return how many were the latest's.
 
     Args:
         nodes: of one bus.
-        tell: called with the other nodes, whose answers are late.
+        on_late: called with the other nodes, whose answers are late.
     """
     settled = 0
     for one in nodes:
@@ -117,5 +117,5 @@ def settle_uncertain(nodes: Iterable[AnsweringNode], tell: Callable[[EventCode, 
             settled += 1
         else:
             one.late += 1
-            tell(EventCode.LATE, one.node, f"its position is {one.age} cycles old")
+            on_late(EventCode.LATE, one.node, f"its position is {one.age} cycles old")
     return settled
