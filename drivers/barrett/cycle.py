@@ -154,7 +154,7 @@ class PuckCodec:
         self._told: set[int] = set()
 
     @property
-    def late(self) -> int:
+    def late_count(self) -> int:
         """Return how many positions came too late or a second time in a cycle, of all pucks together."""
         return sum(puck.late for puck in self.pucks)
 
@@ -191,12 +191,12 @@ class PuckCodec:
                 frames.append(mode)
         return [*frames, pendant]
 
-    def begin_cycle(self, now_ns: int = 0, *, asks: bool = True) -> None:
+    def begin_cycle(self, now_ns: int = 0, *, positions_requested: bool = True) -> None:
         """Begin a cycle after positions were requested: each puck may answer once, and its data is a cycle older.
 
         Args:
             now_ns: time of the requests [ns of the link's clock].
-            asks: whether positions were asked for at all.
+            positions_requested: whether positions were asked for at all.
         """
         self._open, self._now_ns, self._missing = True, now_ns, len(self.pucks)
         self.safety.status_age += 1
@@ -206,7 +206,7 @@ class PuckCodec:
             puck.answered = False
             puck.age += 1
             puck.status_age += 1
-            puck.order.behind += asks
+            puck.order.behind += positions_requested
 
     def end_cycle(self) -> None:
         """End the cycle at its deadline: uncertain answers are decided on, and answers from now on are late."""
@@ -249,7 +249,7 @@ class PuckCodec:
             puck.late += 1
             puck.order.take_late()
             self._tell(EventCode.LATE, puck.node, "its position came after its cycle")
-        elif (age := puck.order.take(stamp_ns - self._now_ns if stamp_ns else None)) is None:
+        elif (age := puck.order.take_answer(stamp_ns - self._now_ns if stamp_ns else None)) is None:
             puck.late += 1
             self._tell(EventCode.DUPLICATE, puck.node, "a second position in one cycle")
         else:
@@ -419,7 +419,7 @@ class PuckBus:
             for frame in torques:
                 link.send(frame)
         self.stamp_doubt_ns = stamp_ns - before_ns if stamp_ns - before_ns > _DOUBT * self._period_ns else 0
-        codec.begin_cycle(stamp_ns, asks=not silent)
+        codec.begin_cycle(stamp_ns, positions_requested=not silent)
         deadline = max(begin_ns + round(_RECEIVE * self._period_ns), stamp_ns + self._least_ns)
         while not codec.complete:
             answer = link.receive(deadline)
@@ -435,10 +435,10 @@ class PuckBus:
 
     def answers_late(self) -> bool:
         """Leave out one cycle's request; return whether positions came nevertheless: answers are a request late."""
-        before = self.codec.late
+        before = self.codec.late_count
         self._next_ns = (self._next_ns or 0) + self._period_ns
         self.cycle(None)
-        return self.codec.late > before
+        return self.codec.late_count > before
 
     def _require_inactive(self) -> None:
         """Raise DriverError unless the safety puck says, now, that the arm is not active."""

@@ -69,7 +69,7 @@ class JointEncoders:
         self._motors_of = coordinates.motors_of
         self._counts: dict[int, int] = {}
         self._origin: dict[int, float] = {}
-        self.forget_told()
+        self.reset_counts()
         self._position = np.full(len(names), np.nan)
 
     def checks(self, pucks: Sequence[MotorPuck]) -> tuple[SetupCheck, ...]:
@@ -88,14 +88,14 @@ class JointEncoders:
             if (puck.encoder is not None) or k in self._radians
         )
 
-    def begin(self, pucks: Sequence[MotorPuck], position: Vector) -> None:
+    def set_origins(self, pucks: Sequence[MotorPuck], position: Vector) -> None:
         """Set the encoders' origins so that they agree with the motors' position [rad], shape (joints,)."""
         for k in self._radians:
             self._counts[k] = pucks[k].encoder or 0
             self._origin[k] = float(position[k]) - self._counts[k] * self._radians[k]
-        self.forget_told()
+        self.reset_counts()
 
-    def forget_told(self) -> None:
+    def reset_counts(self) -> None:
         """Reset the counts of deviations and of missing encoders, so that what persists is reported again."""
         self._beyond = dict.fromkeys(self._radians, 0)
         self._without = dict.fromkeys(self._radians, 0)
@@ -243,7 +243,7 @@ class BarrettArm(Arm):
             self.close()
 
     def log_frames(self, path: Path) -> None:
-        """Have the next session log every frame to a new file; DriverError where its suffix names no format."""
+        """Have the next session log every frame to a new file; DriverError for its suffix, at `open` if it exists."""
         self._session.log_frames(path)
 
     def logged(self) -> str:
@@ -310,7 +310,7 @@ class BarrettArm(Arm):
         return budget(self._driver, self._config.control.rate if rate is None else rate)
 
     def setup_checks(self) -> tuple[SetupCheck, ...]:
-        """Return what pucks of the open arm report beside the expected, and a check of a CAN controller in trouble."""
+        """Return checks of the open arm's pucks and of a CAN controller in trouble; DriverError while not open."""
         return self._checks + controller_checks(self._driver.bus.channel, self._require_open().codec.controller)
 
     def watchdogs(self) -> tuple[Watchdog, ...]:
@@ -350,7 +350,7 @@ class BarrettArm(Arm):
             self.stop(StopKind.TORQUE_OFF)
             raise
         bus.codec.forget_events()
-        self._joint_encoders.forget_told()
+        self._joint_encoders.reset_counts()
         self._enabled = True
 
     def reset(self) -> None:
@@ -491,7 +491,7 @@ class BarrettArm(Arm):
         nearest = zip(self._coordinates.zero, bus.codec.pucks, strict=True)
         self._unwrapped = [zero + puck.position for zero, puck in nearest]  # 22 bits are 512 turns: no arm wraps
         self._checks += self._joint_encoders.checks(bus.codec.pucks)
-        self._joint_encoders.begin(bus.codec.pucks, self._coordinates.positions(self._unwrapped))
+        self._joint_encoders.set_origins(bus.codec.pucks, self._coordinates.positions(self._unwrapped))
         bus.codec.forget_events()
         bus.lost = 0
 

@@ -92,23 +92,23 @@ class PropertyPort:
                     return answer.value
         return None
 
-    def read(self, node: int, properties: Properties, name: str) -> int:
+    def read(self, node: int, properties: Properties, property_name: str) -> int:
         """Return the value of a property; raises DriverError where no answer comes."""
-        value = self.ask(node, properties.number(name))
+        value = self.ask(node, properties.number(property_name))
         if value is None:
-            raise DriverError(f"puck {node} does not answer for {name}; check power, cable and bit rate")
+            raise DriverError(f"puck {node} does not answer for {property_name}; check power, cable and bit rate")
         return value
 
-    def write(self, node: int, properties: Properties, name: str, value: int, *, verify: bool = True) -> None:
+    def write(self, node: int, properties: Properties, property_name: str, value: int, *, verify: bool = True) -> None:
         """Set a property, wait a moment, and read it back if `verify`; DriverError where it holds another value.
 
         Raises:
             DriverError: it does not answer, or holds another value then.
         """
-        self.link.send(set_frame(node, properties.number(name), value))
+        self.link.send(set_frame(node, properties.number(property_name), value))
         self.pause(_APART)
-        if verify and (found := self.read(node, properties, name)) != value:
-            raise DriverError(f"puck {node}: {name} is {found} after {value} was written")
+        if verify and (found := self.read(node, properties, property_name)) != value:
+            raise DriverError(f"puck {node}: {property_name} is {found} after {value} was written")
 
     def positions(self, properties: Properties, nodes: Iterable[int]) -> dict[int, int]:
         """Request the positions of the whole arm with one frame; return those that come in time [counts], by node."""

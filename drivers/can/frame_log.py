@@ -189,7 +189,7 @@ class SessionLog:
         return LoggedLink(link, self, bus, fd)
 
     def close(self) -> None:
-        """Finish the file and set `report`; any number of times."""
+        """Wait, a minute at most, until the writing process has finished the file, and set `report`."""
         if self.report is not None:
             return
         with suppress(OSError):

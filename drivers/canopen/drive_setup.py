@@ -166,7 +166,7 @@ def _off(objects: Objects, pdo: Pdo) -> None:
     if objects.read(pdo.off.entry) & _NOT_VALID:
         return
     try:
-        objects.set(pdo.off)
+        objects.write_verified(pdo.off)
     except SdoRefused as refused:
         if refused.code not in READ_ONLY:
             raise
@@ -181,7 +181,7 @@ def _map(objects: Objects, variants: Sequence[Pdo]) -> None:
             return
         try:
             for write in pdo.mapping:
-                objects.set(write)
+                objects.write_verified(write)
         except SdoRefused as refused:
             refusals.append(refused)
         else:
@@ -334,9 +334,9 @@ def motor_limits(config: ArmConfig, coordinates: Coordinates) -> list[MotorLimit
     return [MotorLimits(*one) for one in zip(limits, speeds, brakes, torques, strict=True)]
 
 
-def watchdogs_of(driver: CanopenDriver, names: Sequence[str]) -> tuple[Watchdog, ...]:
-    """Return the watchdog of each drive; `names` are what people call the drives."""
-    found, of_torque = zip(names, driver.drives, strict=True), ("rpdo_timer", "vendor")
+def watchdogs_of(driver: CanopenDriver, drive_names: Sequence[str]) -> tuple[Watchdog, ...]:
+    """Return the watchdog of each drive; `drive_names` are what people call the drives."""
+    found, of_torque = zip(drive_names, driver.drives, strict=True), ("rpdo_timer", "vendor")
     seconds = driver.watchdog_seconds
     return tuple(Watchdog(name, one.watchdog, seconds(one), one.watchdog in of_torque) for name, one in found)
 

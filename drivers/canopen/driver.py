@@ -374,7 +374,7 @@ class CanopenArm(Arm):
             return arm.set_home()
 
     def log_frames(self, path: Path) -> None:
-        """Have the next session log every frame to a new file; DriverError where its suffix names no format."""
+        """Have the next session log every frame to a new file; DriverError for its suffix, at `open` if it exists."""
         self._session.log_frames(path)
 
     def logged(self) -> str:
@@ -402,11 +402,11 @@ class CanopenArm(Arm):
                 buses.close()  # without the farewell of `close`, which another host's drives would obey
                 raise
             self._buses = buses
-            buses.call()
+            buses.wake_drives()
             self._stop_enabled_drives(buses)
             self._find_zero(buses)
             self._identities = tuple(self._configured(buses))
-            buses.begin()
+            buses.start_pdos()
             self._require_no_restart(buses)
         except BaseException:
             self.close()

@@ -277,19 +277,19 @@ class BusCodec:
         """Return the frame with an NMT command for one node, or for all (0)."""
         return Frame(NMT, bytes([command, node]))
 
-    def begin_cycle(self, now_ns: int = 0, *, asks: bool = True) -> None:
+    def begin_cycle(self, now_ns: int = 0, *, positions_requested: bool = True) -> None:
         """Begin a cycle after SYNC was sent: each drive may answer once, and its data is a cycle older.
 
         Args:
             now_ns: time of SYNC [ns of the link's clock], for frames without a stamp.
-            asks: whether SYNC has been sent in it at all.
+            positions_requested: whether SYNC, which requests positions, has been sent in it at all.
         """
         self._open, self._now_ns, self._missing = True, now_ns, len(self.drives)
         for drive in self.drives:
             drive.answered = False
             drive.age += 1
             drive.status_age += 1
-            drive.order.behind += asks
+            drive.order.behind += positions_requested
 
     def end_cycle(self) -> None:
         """End the cycle at its deadline: uncertain answers are decided on, and answers from now on are late."""
@@ -355,7 +355,7 @@ class BusCodec:
             drive.late += 1
             drive.order.take_late()
             self._tell(EventCode.LATE, drive.node, "its position came after its cycle")
-        elif (age := drive.order.take(frame.stamp_ns - self._now_ns if frame.stamp_ns else None)) is None:
+        elif (age := drive.order.take_answer(frame.stamp_ns - self._now_ns if frame.stamp_ns else None)) is None:
             drive.duplicates += 1
             self._tell(EventCode.DUPLICATE, drive.node, "a second position in one cycle")
         else:

@@ -157,14 +157,14 @@ class Objects:
     def ensure(self, write: Write) -> None:
         """Write an entry unless it holds the value, and read it back; SdoRefused or WriteNotVerified if that fails."""
         if not none_if_missing(self.holds, write):  # setting a missing entry raises the error
-            self.set(write)
+            self.write_verified(write)
 
     def write_if_present(self, write: Write) -> None:
         """Write an entry where it holds another value, and read it back; do nothing where the drive has none."""
         if none_if_missing(self.holds, write) is False:
-            self.set(write)
+            self.write_verified(write)
 
-    def set(self, write: Write) -> None:
+    def write_verified(self, write: Write) -> None:
         """Set an entry and read it back; WriteNotVerified if it holds something else, SdoRefused if aborted."""
         self.write(write)
         held = self.read(write.entry)

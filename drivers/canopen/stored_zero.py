@@ -73,9 +73,9 @@ class Zeros:
         return counts if mark == self.mark(drive_index, counts) and mark else None
 
     def store(self, objects: Objects, drive_index: int, counts: int) -> None:
-        """Store these counts at home and their mark in a drive, and read them back; raises as `Objects.set`."""
-        objects.set(Write(od.ZERO_COUNTS, counts & 0xFFFF_FFFF))
-        objects.set(Write(od.ZERO_MARK, self.mark(drive_index, counts)))
+        """Store counts at home and their mark in a drive, and read them back; raises as `Objects.write_verified`."""
+        objects.write_verified(Write(od.ZERO_COUNTS, counts & 0xFFFF_FFFF))
+        objects.write_verified(Write(od.ZERO_MARK, self.mark(drive_index, counts)))
 
     def restore_mark(self, objects: Objects, drive_index: int, counts: int, restarted: Callable[[], bool]) -> bool:
         """Store a drive's counts at home again, or delete its mark if it has restarted; return True if stored.
@@ -90,7 +90,7 @@ class Zeros:
             Whether the drive confirms them; otherwise its mark has been deleted.
 
         Raises:
-            DriverError: as `Objects.set`.
+            DriverError: as `Objects.write_verified`.
         """
         if not restarted():
             self.store(objects, drive_index, counts)
@@ -100,8 +100,8 @@ class Zeros:
         return False
 
     def delete_mark(self, objects: Objects) -> None:
-        """Delete the mark in a drive, so that it confirms nothing, and read it back; raises as `Objects.set`."""
-        objects.set(Write(od.ZERO_MARK, 0))
+        """Set a drive's mark to 0, which confirms no zero, and read it back; raises as `Objects.write_verified`."""
+        objects.write_verified(Write(od.ZERO_MARK, 0))
 
     def require_volatile_storage(self, objects: Objects) -> None:
         """Raise DriverError where a drive has no object 1020h for a zero, or would keep it without power.

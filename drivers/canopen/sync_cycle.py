@@ -157,14 +157,14 @@ class Buses:
         if deaf or gone:
             link.send(codec.control_download(drive.node, word))
 
-    def ask(self, drive_index: int, entry: Entry) -> None:
+    def request_upload(self, drive_index: int, entry: Entry) -> None:
         """Send the upload of an entry of up to four bytes; the answer comes with a later cycle (`Drive.uploads`)."""
         codec, link = self._at[drive_index]
         codec.asked.add(entry.key)
         link.send(Frame(SDO_REQUEST + self.drives[drive_index].node, upload_request(entry)))
 
     def mode_shown(self, drive_index: int) -> int | None:
-        """Return the mode of operation by a drive's last answer to `ask`; None before one."""
+        """Return the mode of operation by a drive's last answer to `request_upload`; None before one."""
         display = self.modes[drive_index].display
         data = self.drives[drive_index].uploads.get(display.key)
         return display.unpack(data) if data is not None and len(data) == display.kind.size else None
@@ -180,7 +180,7 @@ class Buses:
         if found and now_ns >= self._ask_again_ns:
             self._asked, self._ask_again_ns = self._asked + 1, now_ns + _ASK_EVERY_NS
             number = list(found)[self._asked % len(found)]
-            self.ask(number, self.modes[number].display)
+            self.request_upload(number, self.modes[number].display)
         return found
 
     def forget_modes(self) -> None:
@@ -192,7 +192,7 @@ class Buses:
         """Return the link to the bus that a drive is on."""
         return self._at[drive_index][1]
 
-    def hear(self, drive_index: int, deadline_ns: int) -> None:
+    def receive_one(self, drive_index: int, deadline_ns: int) -> None:
         """Wait for one frame on the bus of a drive, and decode it; raises DriverError on a dead bus."""
         codec, link = self._at[drive_index]
         if (frame := link.receive(deadline_ns)) is not None:
@@ -246,7 +246,7 @@ class Buses:
                 if frame.error:
                     codec.receive(frame)
 
-    def call(self) -> None:
+    def wake_drives(self) -> None:
         """Bring every drive to pre-operational, and wait until all answer by SDO; raises DriverError if some do not.
 
         A drive that was just switched on may still boot, one whose last host died may be operational. Communication is
@@ -277,7 +277,7 @@ class Buses:
                 f"no answer of drives {silent} within {AWAKE:g} s; check power, cable and bit rate (`ident bus scan`)"
             )
 
-    def begin(self) -> None:
+    def start_pdos(self) -> None:
         """Start PDOs once drives and host are configured, and wait until all drives answer every SYNC in time.
 
         At first every drive reports its state, which takes the bus longer than a cycle. Whether answers are of the SYNC
@@ -345,7 +345,7 @@ class Buses:
         stamp_ns = self.clock.now_ns()
         self.stamp_doubt_ns = stamp_ns - before_ns if stamp_ns - before_ns > _DOUBT * self._period_ns else 0
         for codec in self.codecs:
-            codec.begin_cycle(stamp_ns, asks="sync_loss" not in self.withheld)
+            codec.begin_cycle(stamp_ns, positions_requested="sync_loss" not in self.withheld)
         deadline = max(begin_ns + round(RECEIVE * self._period_ns), stamp_ns + self._least_ns)
         for codec, link in self._pairs:
             while not codec.complete:
@@ -370,7 +370,7 @@ class Buses:
         silent = [number for number, drive in enumerate(self.drives) if drive.age >= _SILENT and not drive.boots]
         if self.enabled and silent:
             self._asked += 1
-            self.ask(silent[self._asked % len(silent)], od.STATUS_WORD)
+            self.request_upload(silent[self._asked % len(silent)], od.STATUS_WORD)
 
     def keep_alive(self) -> None:
         """Send the host's heartbeat when due, and poll a guarded drive that is due, but not what is withheld."""
@@ -411,7 +411,7 @@ class _RepliesInCycles:
             try:
                 self._buses.cycle(self._counts)
             except DriverError:  # of the other bus, maybe, which must not keep this one from it
-                self._buses.hear(self._number, deadline_ns)
+                self._buses.receive_one(self._number, deadline_ns)
         found, drive.reply = drive.reply, None
         return found
 

@@ -227,17 +227,17 @@ def _require_proven(what: str, clearance: Clearance, least: float) -> None:
 SAG = 0.25  # of the following error, that an arm may give way outwards when its torque begins, and lands inside at last
 
 
-def position_limit_violations(position: Vector, limits: MotionLimits, names: Sequence[str]) -> list[str]:
+def position_limit_violations(position: Vector, limits: MotionLimits, joint_names: Sequence[str]) -> list[str]:
     """Return a phrase for each joint that is outside its position limits, as NaN is; empty where none is.
 
     Args:
         position: [rad or m], shape (joints,).
         limits: of the arm.
-        names: of the joints.
+        joint_names: of the joints.
     """
     return [
         f"{name} at {q:.3f}, limits {low:g}..{high:g}"
-        for name, q, low, high in zip(names, position, limits.lower, limits.upper, strict=True)
+        for name, q, low, high in zip(joint_names, position, limits.lower, limits.upper, strict=True)
         if not low <= q <= high
     ]
 
@@ -248,32 +248,32 @@ def recoverable_limits(limits: MotionLimits) -> MotionLimits:
     return replace(limits, lower=limits.lower - more, upper=limits.upper + more)
 
 
-def require_near(position: Vector, limits: MotionLimits, names: Sequence[str]) -> None:
+def require_near(position: Vector, limits: MotionLimits, joint_names: Sequence[str]) -> None:
     """Raise MotionRefused where a joint stands farther outside its position limits than its following error.
 
     Raises:
         MotionRefused: naming every such joint.
     """
-    if position_limit_violations(position, recoverable_limits(limits), names):
+    if position_limit_violations(position, recoverable_limits(limits), joint_names):
         raise MotionRefused(
             "farther outside the position limits than a following error: "
-            f"{'; '.join(position_limit_violations(position, limits, names))}; its zero may be wrong: compare the "
-            "numbers with the arm, and bring it back by hand"
+            f"{'; '.join(position_limit_violations(position, limits, joint_names))}; its zero may be wrong: compare "
+            "the numbers with the arm, and bring it back by hand"
         )
 
 
-def relaxed_limits(position: Vector, limits: MotionLimits, share: float = SAG) -> MotionLimits:
-    """Return limits that contain `position`: widened, where it is outside, to `share` of following error beyond it.
+def relaxed_limits(position: Vector, limits: MotionLimits, following_error_share: float = SAG) -> MotionLimits:
+    """Return limits widened for joints that are outside: to `position` and a share of the following error beyond.
 
     Args:
         position: present position of the arm [rad or m], shape (joints,).
         limits: of the arm.
-        share: share of the following error that is added where a joint stands outside.
+        following_error_share: share of the following error that is added where a joint stands outside.
 
     Returns:
         The limits themselves in all joints that stand inside.
     """
-    more = share * limits.following_error
+    more = following_error_share * limits.following_error
     return replace(
         limits,
         lower=np.where(position < limits.lower, position - more, limits.lower),

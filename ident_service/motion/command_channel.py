@@ -384,7 +384,7 @@ def stop_requested_ns(control_file: Path) -> int:
 
 
 def is_control_file_in_use(control_file: Path) -> bool:
-    """Return whether a process holds the lock of a control file, as the one that moves the arm does.
+    """Return whether a process holds the lock of a control file, as one moving the arm does; DriverError if unreadable.
 
     Raises:
         DriverError: the file cannot be opened, so that nobody can tell.

@@ -24,21 +24,23 @@ from ident_service.motion.faults import Reaction as Reaction
 from ident_service.motion.trajectory import Setpoint
 
 
-def fault_from_events(events: Sequence[AxisEvent], names: Sequence[str], findings: FaultCounter) -> Fault | None:
+def fault_from_events(
+    events: Sequence[AxisEvent], joint_names: Sequence[str], fault_counter: FaultCounter
+) -> Fault | None:
     """Make a fault or a counted warning of each event of a sample; return the most severe one, None without events.
 
     Args:
         events: of the sample.
-        names: of the joints.
-        findings: counter that makes the faults and counts every warning.
+        joint_names: of the joints.
+        fault_counter: counter that makes the faults and counts every warning.
 
     Returns:
         The most severe fault, the first of equals; None without events.
     """
     worst: Fault | None = None
     for event in events:
-        whose = "" if event.axis is None else f"{names[event.axis]}: "
-        found = findings.count_fault(event.code.value, f"{whose}{event.words}")
+        whose = "" if event.axis is None else f"{joint_names[event.axis]}: "
+        found = fault_counter.count_fault(event.code.value, f"{whose}{event.words}")
         if worst is None or found.reaction > worst.reaction:
             worst = found
     return worst
@@ -220,20 +222,20 @@ def approach_speed(distance: Vector, limits: MotionLimits) -> Vector:
     return np.asarray(np.sqrt(squared + (ENVELOPE_SLACK * limits.velocity) ** 2))
 
 
-def describe_check(check: Check, names: Sequence[str], units: Sequence[str]) -> str:
+def describe_check(check: Check, joint_names: Sequence[str], joint_units: Sequence[str]) -> str:
     """Describe a violated check in words: the joints concerned, and what was measured.
 
     Args:
         check: check with at least one hit.
-        names: of the joints.
-        units: units of the joints' positions.
+        joint_names: of the joints.
+        joint_units: units of the joints' positions.
     """
     hit: list[int] = np.flatnonzero(check.hit).tolist()
-    names = check.names or names
+    joint_names = check.names or joint_names
     texts = [", ".join(f"{number[k]:.4g}" for k in hit) for number in check.numbers]
-    unit = "" if check.names else units[hit[0]]
+    unit = "" if check.names else joint_units[hit[0]]
     force = {"rad": "N m", "m": "N"}.get(unit, "")
-    return f"{', '.join(dict.fromkeys(names[k] for k in hit))}: {check.what.format(*texts, u=unit, f=force)}"
+    return f"{', '.join(dict.fromkeys(joint_names[k] for k in hit))}: {check.what.format(*texts, u=unit, f=force)}"
 
 
 def _limit_excess(position: Vector, limits: MotionLimits) -> tuple[Vector, Vector]:
@@ -420,38 +422,38 @@ class SafetyMonitor:
                 fault = event
         return usable, fault
 
-    def limit_torque(self, wanted: Vector) -> tuple[Vector, Fault | None]:
+    def limit_torque(self, computed_torque: Vector) -> tuple[Vector, Fault | None]:
         """Return the torque limited in size and rate (the first in size only; 0 if refused), and its fault or None.
 
         Args:
-            wanted: torque demanded by the controller [N m or N], shape (joints,).
+            computed_torque: torque demanded by the controller [N m or N], shape (joints,).
 
         Returns:
             The torque that may leave: within limits, or zero when the fault takes torque away. The first one is not
             limited in rate, because the support yields to it.
         """
         limit, before, motors = self._limits.torque, self._sent, self._limits.motors
-        size = np.abs(wanted)
+        size = np.abs(computed_torque)
         if (
             all((size <= limit).tolist())
-            and (motors is None or all((motors.used(wanted) <= 1.0).tolist()))
-            and (before is None or all((np.abs(wanted - before) <= self.rate).tolist()))
+            and (motors is None or all((motors.used(computed_torque) <= 1.0).tolist()))
+            and (before is None or all((np.abs(computed_torque - before) <= self.rate).tolist()))
         ):
-            self._sent = wanted
-            return wanted, None
-        finite = np.isfinite(wanted)
+            self._sent = computed_torque
+            return computed_torque, None
+        finite = np.isfinite(computed_torque)
         what = f"a torque of {{}} {{f}} was requested, more than {ABSURD:g} times the limit of {{}}"
         for check in (
             Check("torque_not_finite", ~finite, "the requested torque is not a number"),
-            Check("torque_absurd", finite & (size > ABSURD * limit), what, (wanted, limit)),
+            Check("torque_absurd", finite & (size > ABSURD * limit), what, (computed_torque, limit)),
         ):
             if check.hit.any():
                 return np.zeros_like(limit), self._found(check)
-        leaves = np.clip(wanted, -limit, limit)
+        leaves = np.clip(computed_torque, -limit, limit)
         over, fault = size > limit, None
         if over.any():
             what = "a torque of {} {f} was requested, the limit is {}"
-            fault = self._found(Check("torque_saturated", over, what, (wanted, limit)))
+            fault = self._found(Check("torque_saturated", over, what, (computed_torque, limit)))
         if motors is not None and (over := motors.used(leaves) > 1.0).any():
             what = "a torque of {} N m was requested, the limit is {}"
             asked = leaves @ motors.to_motors.T
@@ -466,33 +468,33 @@ class SafetyMonitor:
         self._sent = leaves
         return leaves, fault
 
-    def limit_position(self, wanted: Vector) -> tuple[Vector, Fault | None]:
+    def limit_position(self, reference_position: Vector) -> tuple[Vector, Fault | None]:
         """Return the position limited in step for the drives (the last one if refused), and its fault or None.
 
         Args:
-            wanted: position demanded by the trajectory [rad or m], shape (joints,).
+            reference_position: position demanded by the trajectory [rad or m], shape (joints,).
 
         Returns:
             The position that may leave: no farther from the last one than the joints move in a cycle at `VELOCITY_STOP`
             times their velocity limit, first from where the arm stands; the last one when the fault ends motion.
         """
-        finite = np.isfinite(wanted)
+        finite = np.isfinite(reference_position)
         if not finite.all():
             return self._target, self._found(
                 Check("position_not_finite", ~finite, "the position asked for is no number")
             )
-        beyond, limit = _limit_excess(wanted, self._limits)
+        beyond, limit = _limit_excess(reference_position, self._limits)
         if (outside := beyond > _ROUNDING).any():
             what = "a position of {} {u} was asked for, the limit is {} {u}"
-            return self._target, self._found(Check("position_outside", outside, what, (wanted, limit)))
-        step, most = wanted - self._target, VELOCITY_STOP * self._limits.velocity * self._period
+            return self._target, self._found(Check("position_outside", outside, what, (reference_position, limit)))
+        step, most = reference_position - self._target, VELOCITY_STOP * self._limits.velocity * self._period
         fast, fault = np.abs(step) > most, None
         if fast.any():
             what = "the position was to change by {} {u} in a cycle, {} {u} allowed"
             fault = self._found(Check("position_rate", fast, what, (step, most)))
-            wanted = self._target + np.clip(step, -most, most)
-        self._target = wanted
-        return wanted, fault
+            reference_position = self._target + np.clip(step, -most, most)
+        self._target = reference_position
+        return reference_position, fault
 
     def _rate_limited(self, before: Vector, wanted: Vector) -> Vector:
         """Return the torque on the way from the last one to the one wanted that the rate allows."""

@@ -140,13 +140,13 @@ def stop_extent(motion: Path, limits: MotionLimits) -> tuple[Vector, Vector]:
     return lowest, highest
 
 
-def require_stops_within_limits(motion: Path, limits: MotionLimits, names: tuple[str, ...]) -> None:
+def require_stops_within_limits(motion: Path, limits: MotionLimits, joint_names: tuple[str, ...]) -> None:
     """Raise MotionRefused where a stop out of the motion, sampled every 5 ms, would leave a joint's position limits.
 
     Args:
         motion: the motion.
         limits: of the arm.
-        names: of the joints, for the message.
+        joint_names: of the joints, for the message.
 
     Raises:
         MotionRefused: naming every joint and how far it would go.
@@ -156,7 +156,7 @@ def require_stops_within_limits(motion: Path, limits: MotionLimits, names: tuple
     slack = 1e-9 * (1.0 + np.maximum(np.abs(limits.lower), np.abs(limits.upper)))
     found = [
         f"{name}: {low:.3f}..{high:.3f} leaves {limits.lower[k]:g}..{limits.upper[k]:g}"
-        for k, (name, low, high) in enumerate(zip(names, lowest, highest, strict=True))
+        for k, (name, low, high) in enumerate(zip(joint_names, lowest, highest, strict=True))
         if not (low >= limits.lower[k] - slack[k] and high <= limits.upper[k] + slack[k])  # NaN too
     ]
     if found:

@@ -230,7 +230,7 @@ def import_configuration(
                 for key, write in writes.items():
                     if key not in ours and not objects.holds(write):
                         changes.append(Change(write.entry, objects.read(write.entry), write.value))
-                        objects.set(write)
+                        objects.write_verified(write)
                 same = len(writes) - len(ours) - len(changes)
                 outcome = tuple(changes), same, len(ours), left_out[number - 1]
                 done.append(ImportedDrive(number, objects.node, file.name, *outcome))

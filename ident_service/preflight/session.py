@@ -396,7 +396,7 @@ class Session:
         self._target = self._passed(self._target) if self.gives_positions else self._limited(self._target)
 
     def trace(self) -> Trace:
-        """Return the cycles of the last `follow` as a trace, also of one that a fault ended."""
+        """Return the cycles of the last `follow` as arrays with even time steps, also if a fault ended it."""
         return trace_of(self._rows, self.period)
 
     def release(self) -> None:

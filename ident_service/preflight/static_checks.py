@@ -220,7 +220,7 @@ def distance_from_home_text(model: ArmModel, limits: MotionLimits, position: Vec
 
 
 def path_home_check(model: ArmModel, limits: MotionLimits, position: Vector) -> Check:
-    """Return the check `ways_clear`: the straight way home is clear and slow enough, from `position` [rad or m]."""
+    """Return the check `ways_clear`: the straight way home is clear, and elbow and tip are slow enough on it."""
     code = "ways_clear"
     try:
         ((_, leg),) = PointToPointPlan(Destination.HOME).legs(model, position, limits)
