@@ -164,7 +164,7 @@ def test_what_cannot_be_put_on_its_core_is_not_left_running_and_nothing_fails(mo
 def test_what_keeps_a_core_from_halting_ends_with_a_loop_that_is_killed() -> None:
     code = (
         "import os, sys, contextlib; from pathlib import Path; from ident_service.motion import realtime\n"
-        "realtime.halts = lambda driver: True\n"
+        "realtime.idle_cores_halt = lambda driver: True\n"
         f"held = contextlib.ExitStack(); print(realtime._keep_from_halting({CORES[0]}, held, []))\n"
         "print(*Path(f'/proc/self/task/{os.getpid()}/children').read_text().split(), flush=True)\n"
         "os.kill(os.getpid(), 9)"
