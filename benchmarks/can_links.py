@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.harness import Row, table, write
-from drivers.can.bus_load import exact
+from drivers.can.bus_load import exact_bits
 from drivers.can.can_frame import Frame
 from drivers.can.can_link import Link
 from drivers.can.frame_log import SessionLog
@@ -115,10 +115,10 @@ def _percentiles(name: str, nanoseconds: np.ndarray) -> list[Row]:
 
 def _bits() -> list[Row]:
     frame, repeats = Frame(0x181, b"\x12\x34\x56\x78"), 20_000
-    exact(frame)
+    exact_bits(frame)
     begin = time.perf_counter()
     for _ in range(repeats):
-        exact(frame)
+        exact_bits(frame)
     return [Row("exact bits of a frame", (time.perf_counter() - begin) / repeats * 1e6, "us")]
 
 

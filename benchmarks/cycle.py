@@ -46,7 +46,7 @@ def measure(model: ArmModel) -> list[Row]:
     deadlines = Deadlines(guard.findings, period)
     valid, age = np.ones(7, dtype=bool), np.zeros(7, dtype=np.int64)
     wanted = control.torque(home, valid, reference.at(0.0))
-    torque, _ = guard.torque(wanted)
+    torque, _ = guard.limit_torque(wanted)
     rows: list[Row] = []
     fd = create_ring(7)
     ring = RingWriter(fd)
@@ -62,14 +62,14 @@ def measure(model: ArmModel) -> list[Row]:
             position = np.rint(setpoint.position / steps) * steps
             sample = Sample(cycle, stamp_ns, position, None, torque, valid, age, 0, (1,) * 7)
             start = clock()
-            deadlines.cycle(stamp_ns, stamp_ns)
-            usable, _ = guard.feedback(
+            deadlines.judge_cycle(stamp_ns, stamp_ns)
+            usable, _ = guard.check_feedback(
                 sample, setpoint, control.velocity, control.correction, control.feedback_acceleration
             )
             seen = clock()
             wanted = control.torque(position, usable, setpoint)
             law = clock()
-            torque, _ = guard.torque(wanted)
+            torque, _ = guard.limit_torque(wanted)
             judged = clock()
             ring.put(
                 Cycle(

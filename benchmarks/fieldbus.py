@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.harness import Row, table, write
-from drivers.can.bus_load import exact
+from drivers.can.bus_load import exact_bits
 from drivers.can.can_frame import Frame
 from drivers.canopen.motor_units import coordinates
 from drivers.canopen.pdo_codec import BusCodec
@@ -43,7 +43,7 @@ def measure(config: ArmConfig) -> list[Row]:
         counts, _ = gears.torque_counts(torques[cycle])
         geared = clock()
         codec.torque_frames(counts)
-        codec.sync()
+        codec.sync_frame()
         codec.begin_cycle(cycle)
         for reply in replies[cycle]:
             codec.receive(reply)
@@ -63,7 +63,7 @@ def measure(config: ArmConfig) -> list[Row]:
     begin = clock()
     for row in replies[:WARM_UP]:
         for reply in row:
-            exact(reply)
+            exact_bits(reply)
     rows.append(Row("exact length of a frame, mean", (clock() - begin) / (7e3 * WARM_UP), "us"))
     return rows
 

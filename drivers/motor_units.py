@@ -106,14 +106,14 @@ class Coordinates:
             found.append((round(zero + ends.min(axis=0).sum()), round(zero + ends.max(axis=0).sum())))
         return found
 
-    def zeroed(self, counts: Sequence[int], position: Vector) -> Coordinates:
+    def zeroed(self, counts: Sequence[int], home_position: Vector) -> Coordinates:
         """Return coordinates for an arm whose motors are at these counts while its joints are at this position.
 
         Args:
             counts: counts of the motors, one each.
-            position: of the joints [rad or m], shape (n,).
+            home_position: of the joints [rad or m], shape (n,).
         """
-        return replace(self, zero=tuple(counts), offset=np.array(position, dtype=float))
+        return replace(self, zero=tuple(counts), offset=np.array(home_position, dtype=float))
 
     def torque_counts(self, torque: Vector) -> tuple[list[int], bool]:
         """Return each motor's counts for joint torques, scaled down by group to the limits, and whether any group was.
@@ -150,15 +150,18 @@ class Coordinates:
 
 
 def motor_coordinates(
-    transmission: Transmission, counts_per_turn: Sequence[int], newton: Sequence[float], most: Sequence[int]
+    transmission: Transmission,
+    counts_per_turn: Sequence[int],
+    torque_per_count: Sequence[float],
+    max_torque_counts: Sequence[int],
 ) -> Coordinates:
     """Return the coordinates of an arm, with counts of 0 where the transmission has its zero.
 
     Args:
         transmission: the arm's.
         counts_per_turn: of each motor's encoder.
-        newton: torque that each motor really gives for one count of torque [N m].
-        most: largest counts of torque that each motor may be asked for, either way.
+        torque_per_count: torque that each motor really gives for one count of torque [N m].
+        max_torque_counts: largest counts of torque that each motor may be asked for, either way.
 
     Raises:
         DriverError: not as many motors as ratios.
@@ -175,28 +178,28 @@ def motor_coordinates(
     for motors, joints in groups:
         inside[np.ix_(joints, motors)] = True
     joint_per_motor[~inside] = 0.0
-    radians, per_count = 2.0 * pi / np.array(counts_per_turn), np.array(newton)
+    radians, per_count = 2.0 * pi / np.array(counts_per_turn), np.array(torque_per_count)
     return Coordinates(
         joint_per_motor * radians,
         motor_per_joint.T * per_count,
         joint_per_motor.T / per_count[:, None],
         np.array(transmission.offsets or np.zeros(size)),
         (0,) * size,
-        tuple(most),
+        tuple(max_torque_counts),
         groups,
     )
 
 
-def unwrapped(before: int, counts: int, bits: int = 32) -> int:
+def unwrapped(counts_before: int, counts: int, bits: int = 32) -> int:
     """Return a position without wrap-around: the value nearest to the one before.
 
     Args:
-        before: the last position, unwrapped [counts].
+        counts_before: the last position, unwrapped [counts].
         counts: present position of the drive [counts], a signed number of so many bits.
         bits: number of bits of the drive's counter.
     """
     turn = 1 << bits
-    return before + (counts - before + turn // 2) % turn - turn // 2
+    return counts_before + (counts - counts_before + turn // 2) % turn - turn // 2
 
 
 def _groups(coupling: Matrix) -> tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]:

@@ -37,16 +37,16 @@ from drivers.barrett.protocol import (
     Status,
     address_of,
     decoded,
-    get,
+    get_frame,
     pendant_of,
     pendant_value,
     position_frame,
-    reply,
+    reply_frame,
     torque_frame,
 )
 from drivers.barrett.setup import TIMEOUT
 from drivers.can.answer_order import AnswerOrder, settle_uncertain
-from drivers.can.bus_load import ROUND_RATES, Budget, BusLoad, Line, line_of, mean_bits, shares, worst
+from drivers.can.bus_load import ROUND_RATES, Budget, BusLoad, Line, line_of, load_text, mean_bits, most_bits
 from drivers.can.bus_state import HOST as BUS
 from drivers.can.bus_state import (
     LEFT_NORMAL,
@@ -139,7 +139,7 @@ class PuckCodec:
         self.unexplained: int | None = None
         self._waits_for: set[int] = set()
         self.controller = ControllerState.ACTIVE
-        self.request = get(Group.ARM, motors.number("P"), group=True)
+        self.request = get_frame(Group.ARM, motors.number("P"), group=True)
         self._torque = motors.number("T")
         self._mode, self._stat = motors.number("MODE"), motors.number("STAT")
         self._safety = safety
@@ -154,7 +154,7 @@ class PuckCodec:
         self._told: set[int] = set()
 
     @property
-    def late(self) -> int:
+    def late_count(self) -> int:
         """Return how many positions came too late or a second time in a cycle, of all pucks together."""
         return sum(puck.late for puck in self.pucks)
 
@@ -163,40 +163,40 @@ class PuckCodec:
         """Return whether every puck has answered in this cycle."""
         return self._missing == 0
 
-    def torque_frames(self, counts: Sequence[int]) -> list[Frame]:
+    def torque_frames(self, torque_counts: Sequence[int]) -> list[Frame]:
         """Return a frame per group of pucks with torques [counts], given in the arm's order; DriverError if too big."""
         frames = []
         for group, members in self._slots:
             slots = [0, 0, 0, 0]
             for slot, number in members:
-                slots[slot] = counts[number]
+                slots[slot] = torque_counts[number]
             frames.append(torque_frame(group, self._torque, slots))
         return frames
 
     @property
-    def reasons(self) -> list[Frame]:
+    def safety_questions(self) -> list[Frame]:
         """Return the frames that ask the safety puck for MODE and PEN: why the arm is not active."""
-        return [get(self.safety.node, self._safety.number(name)) for name in ("MODE", "PEN")]
+        return [get_frame(self.safety.node, self._safety.number(name)) for name in ("MODE", "PEN")]
 
     def questions(self) -> list[Frame]:
         """Return the frames that ask all pucks for MODE, those not in torque mode for STAT, the safety puck for PEN."""
-        mode = get(self.safety.node, self._safety.number("MODE"))
-        pendant = get(self.safety.node, self._safety.number("PEN"))
+        mode = get_frame(self.safety.node, self._safety.number("MODE"))
+        pendant = get_frame(self.safety.node, self._safety.number("PEN"))
         frames = [mode]
         for number, puck in enumerate(self.pucks):
-            frames.append(get(puck.node, self._mode))
+            frames.append(get_frame(puck.node, self._mode))
             if puck.mode != Mode.TORQUE:  # one that follows torques has no error
-                frames.append(get(puck.node, self._stat))
+                frames.append(get_frame(puck.node, self._stat))
             if number == len(self.pucks) // 2:
                 frames.append(mode)
         return [*frames, pendant]
 
-    def begin_cycle(self, now_ns: int = 0, *, asks: bool = True) -> None:
+    def begin_cycle(self, now_ns: int = 0, *, positions_requested: bool = True) -> None:
         """Begin a cycle after positions were requested: each puck may answer once, and its data is a cycle older.
 
         Args:
             now_ns: time of the requests [ns of the link's clock].
-            asks: whether positions were asked for at all.
+            positions_requested: whether positions were asked for at all.
         """
         self._open, self._now_ns, self._missing = True, now_ns, len(self.pucks)
         self.safety.status_age += 1
@@ -206,7 +206,7 @@ class PuckCodec:
             puck.answered = False
             puck.age += 1
             puck.status_age += 1
-            puck.order.behind += asks
+            puck.order.behind += positions_requested
 
     def end_cycle(self) -> None:
         """End the cycle at its deadline: uncertain answers are decided on, and answers from now on are late."""
@@ -249,7 +249,7 @@ class PuckCodec:
             puck.late += 1
             puck.order.take_late()
             self._tell(EventCode.LATE, puck.node, "its position came after its cycle")
-        elif (age := puck.order.take(stamp_ns - self._now_ns if stamp_ns else None)) is None:
+        elif (age := puck.order.take_answer(stamp_ns - self._now_ns if stamp_ns else None)) is None:
             puck.late += 1
             self._tell(EventCode.DUPLICATE, puck.node, "a second position in one cycle")
         else:
@@ -365,7 +365,7 @@ class PuckBus:
         self._period_ns = period_ns
         frames = [1, *(8 for _ in codec.torque_frames([0] * len(codec.pucks)))]
         frames += [6 if puck.node in driver.joint_encoders else 3 for puck in codec.pucks]
-        wire = sum(worst(length).seconds(driver.bus.bitrate) for length in frames)
+        wire = sum(most_bits(length).seconds(driver.bus.bitrate) for length in frames)
         self._least_ns = round(min(max(_LEAST * period_ns, 1e9 * wire), _RECEIVE * period_ns))
         cycles = driver.status_period * 1e9 / period_ns
         asked = len(codec.pucks) + _OF_SAFETY  # of an active arm; one that is idle is asked for STAT, too
@@ -386,11 +386,11 @@ class PuckBus:
         old = [puck.node for puck in self.codec.pucks if puck.status_age > self._stale]
         return old + ([self.codec.safety.node] if self.codec.safety.status_age > self._stale else [])
 
-    def cycle(self, counts: Sequence[int] | None, *, asks_safety: bool = False) -> int:
+    def cycle(self, torque_counts: Sequence[int] | None, *, asks_safety: bool = False) -> int:
         """Wait for the next cycle and exchange its frames; return when positions were requested [ns of its clock].
 
         Args:
-            counts: torque of every puck [counts]; None for none.
+            torque_counts: torque of every puck [counts]; None for none.
             asks_safety: whether the safety puck's MODE is asked for in this very cycle, beside what is due.
 
         Raises:
@@ -404,7 +404,7 @@ class PuckBus:
             begin_ns += -(-late_ns // self._period_ns) * self._period_ns
             clock.sleep_until_ns(begin_ns)
         self._next_ns = begin_ns + self._period_ns
-        torques = [] if counts is None else codec.torque_frames(counts)
+        torques = [] if torque_counts is None else codec.torque_frames(torque_counts)
         for heard in link.drain():
             codec.receive(heard)
         if self.looks:
@@ -419,7 +419,7 @@ class PuckBus:
             for frame in torques:
                 link.send(frame)
         self.stamp_doubt_ns = stamp_ns - before_ns if stamp_ns - before_ns > _DOUBT * self._period_ns else 0
-        codec.begin_cycle(stamp_ns, asks=not silent)
+        codec.begin_cycle(stamp_ns, positions_requested=not silent)
         deadline = max(begin_ns + round(_RECEIVE * self._period_ns), stamp_ns + self._least_ns)
         while not codec.complete:
             answer = link.receive(deadline)
@@ -435,14 +435,14 @@ class PuckBus:
 
     def answers_late(self) -> bool:
         """Leave out one cycle's request; return whether positions came nevertheless: answers are a request late."""
-        before = self.codec.late
+        before = self.codec.late_count
         self._next_ns = (self._next_ns or 0) + self._period_ns
         self.cycle(None)
-        return self.codec.late > before
+        return self.codec.late_count > before
 
     def _require_inactive(self) -> None:
         """Raise DriverError unless the safety puck says, now, that the arm is not active."""
-        safety, question = self.codec.safety, self.codec.reasons[0]
+        safety, question = self.codec.safety, self.codec.safety_questions[0]
         self.link.send(question)
         until_ns = self.clock.now_ns() + round(TIMEOUT * 1e9)
         while (frame := self.link.receive(until_ns)) is not None:
@@ -459,10 +459,10 @@ class PuckBus:
 
     def _ask(self, asks_safety: bool) -> None:
         if self.codec.unexplained is not None:
-            for frame in self.codec.reasons:
+            for frame in self.codec.safety_questions:
                 self.link.send(frame)
         elif asks_safety:
-            self.link.send(self.codec.reasons[0])
+            self.link.send(self.codec.safety_questions[0])
         self._count += 1
         if self._count % self._every:
             return
@@ -493,12 +493,12 @@ def _budget(driver: BarrettDriver, rate: float) -> Budget:
 
 def _remedies(driver: BarrettDriver, rate: float, plain: Budget) -> Iterator[str]:
     if slower := next((one for one in ROUND_RATES if one <= min(plain.highest_rate, rate)), None):
-        yield f"run at {slower} Hz (control.rate): {shares(_budget(driver, float(slower)).buses[0])}"
+        yield f"run at {slower} Hz (control.rate): {load_text(_budget(driver, float(slower)).buses[0])}"
 
 
 def _lines(driver: BarrettDriver, rate: float) -> Iterator[Line]:
     bus, often = driver.bus, 1.0 / driver.status_period
-    request = get(Group.ARM, _NEWEST.number("P"), group=True).identifier
+    request = get_frame(Group.ARM, _NEWEST.number("P"), group=True).identifier
     yield line_of("request for positions", (request,), 1, rate, bus, _of_request, cyclic=True)
     for length, whose in ((3, "positions"), (6, "positions with joint encoders")):
         nodes = [puck.node for puck in driver.pucks if (puck.node in driver.joint_encoders) == (length == 6)]
@@ -513,8 +513,8 @@ def _lines(driver: BarrettDriver, rate: float) -> Iterator[Line]:
         ("MODE of pucks", [puck.node for puck in driver.pucks], 1.0),
         ("MODE of the safety puck", [driver.safety_node], 2.0),
     ):
-        asked = tuple(get(node, 0).identifier for node in nodes)
-        answers = tuple(reply(node, 0, 0, wide=False).identifier for node in nodes)
+        asked = tuple(get_frame(node, 0).identifier for node in nodes)
+        answers = tuple(reply_frame(node, 0, 0, wide=False).identifier for node in nodes)
         yield line_of(f"asks {whose}", asked, 1, times * often, bus, _of_question)
         yield line_of("answers", answers, 4, times * often, bus, _of_answer)
     yield line_of("asks for the pendant", asked, 1, often, bus, _of_question)
@@ -523,7 +523,7 @@ def _lines(driver: BarrettDriver, rate: float) -> Iterator[Line]:
 
 @lru_cache(maxsize=64)
 def _of_request(identifier: int) -> tuple[float, float]:
-    return mean_bits(identifier, lambda draw: get(0, _NEWEST.number("P")).data)
+    return mean_bits(identifier, lambda draw: get_frame(0, _NEWEST.number("P")).data)
 
 
 @lru_cache(maxsize=64)
@@ -547,19 +547,21 @@ def _of_torques(identifier: int) -> tuple[float, float]:
 
 @lru_cache(maxsize=64)
 def _of_question(identifier: int) -> tuple[float, float]:
-    return mean_bits(identifier, lambda draw: get(0, _NEWEST.number("MODE")).data)
+    return mean_bits(identifier, lambda draw: get_frame(0, _NEWEST.number("MODE")).data)
 
 
 @lru_cache(maxsize=64)
 def _of_answer(identifier: int) -> tuple[float, float]:
     modes = (Mode.TORQUE, SafetyMode.ACTIVE)
-    return mean_bits(identifier, lambda draw: reply(0, _NEWEST.number("MODE"), draw.choice(modes), wide=False).data)
+    return mean_bits(
+        identifier, lambda draw: reply_frame(0, _NEWEST.number("MODE"), draw.choice(modes), wide=False).data
+    )
 
 
 @lru_cache(maxsize=64)
 def _of_pendant(identifier: int) -> tuple[float, float]:
     shown = pendant_value(Pendant(activate_light=True, digit="0"))
-    return mean_bits(identifier, lambda draw: reply(0, _SAFETY.number("PEN"), shown, wide=True).data)
+    return mean_bits(identifier, lambda draw: reply_frame(0, _SAFETY.number("PEN"), shown, wide=True).data)
 
 
 def _counts(draw: random.Random) -> int:

@@ -34,7 +34,7 @@ from drivers.arm import (
 from drivers.axis_status import AxisEvent, AxisEventCode, AxisStatus
 from drivers.barrett import setup
 from drivers.barrett.cycle import MotorPuck, PuckBus, PuckCodec, axis_status, budget
-from drivers.barrett.protocol import POSITION_BITS, Group, Mode, Properties, SafetyMode, Status, get, put
+from drivers.barrett.protocol import POSITION_BITS, Group, Mode, Properties, SafetyMode, Status, get_frame, set_frame
 from drivers.can.bus_load import Budget
 from drivers.can.bus_state import BUS_EVENTS, HOST, Event, EventCode, controller_checks
 from drivers.can.can_link import Link, open_links
@@ -69,7 +69,7 @@ class JointEncoders:
         self._motors_of = coordinates.motors_of
         self._counts: dict[int, int] = {}
         self._origin: dict[int, float] = {}
-        self.forget_told()
+        self.reset_counts()
         self._position = np.full(len(names), np.nan)
 
     def checks(self, pucks: Sequence[MotorPuck]) -> tuple[SetupCheck, ...]:
@@ -88,14 +88,14 @@ class JointEncoders:
             if (puck.encoder is not None) or k in self._radians
         )
 
-    def begin(self, pucks: Sequence[MotorPuck], position: Vector) -> None:
+    def set_origins(self, pucks: Sequence[MotorPuck], position: Vector) -> None:
         """Set the encoders' origins so that they agree with the motors' position [rad], shape (joints,)."""
         for k in self._radians:
             self._counts[k] = pucks[k].encoder or 0
             self._origin[k] = float(position[k]) - self._counts[k] * self._radians[k]
-        self.forget_told()
+        self.reset_counts()
 
-    def forget_told(self) -> None:
+    def reset_counts(self) -> None:
         """Reset the counts of deviations and of missing encoders, so that what persists is reported again."""
         self._beyond = dict.fromkeys(self._radians, 0)
         self._without = dict.fromkeys(self._radians, 0)
@@ -236,14 +236,14 @@ class BarrettArm(Arm):
             raise DriverError(f"{self._config.name}: zeroing needs the home of every joint")
         port = self._open_port()
         try:
-            found = setup.found_on(port, self._driver)
+            found = setup.read_pucks(port, self._driver)
             self._require_reachable(found)
-            return setup.zero(port, found, self._coordinates, home)
+            return setup.write_home(port, found, self._coordinates, home)
         finally:
             self.close()
 
     def log_frames(self, path: Path) -> None:
-        """Have the next session log every frame to a new file; DriverError where its suffix names no format."""
+        """Have the next session log every frame to a new file; DriverError for its suffix, at `open` if it exists."""
         self._session.log_frames(path)
 
     def logged(self) -> str:
@@ -263,14 +263,14 @@ class BarrettArm(Arm):
         self._reset_state()
         try:
             port = self._open_port()
-            found = setup.found_on(port, self._driver, wakes=not self._looks)
+            found = setup.read_pucks(port, self._driver, wakes=not self._looks)
             self._found = found
             self._checks = setup.checks(found)
             self._require_reachable(found)
             if not self._looks:
-                for frame in setup.lowering(found):
+                for frame in setup.idle_frames(found):
                     port.link.send(frame)
-                setup.limit(port, found, self._driver)
+                setup.write_safety_limits(port, found, self._driver)
             if not setup.is_zeroed(port, found):
                 raise PositionUnknown(
                     f"{self._config.name} has not been zeroed since its pucks have power (ZERO is 0): lead it home by "
@@ -310,7 +310,7 @@ class BarrettArm(Arm):
         return budget(self._driver, self._config.control.rate if rate is None else rate)
 
     def setup_checks(self) -> tuple[SetupCheck, ...]:
-        """Return what pucks of the open arm report beside the expected, and a check of a CAN controller in trouble."""
+        """Return checks of the open arm's pucks and of a CAN controller in trouble; DriverError while not open."""
         return self._checks + controller_checks(self._driver.bus.channel, self._require_open().codec.controller)
 
     def watchdogs(self) -> tuple[Watchdog, ...]:
@@ -350,7 +350,7 @@ class BarrettArm(Arm):
             self.stop(StopKind.TORQUE_OFF)
             raise
         bus.codec.forget_events()
-        self._joint_encoders.forget_told()
+        self._joint_encoders.reset_counts()
         self._enabled = True
 
     def reset(self) -> None:
@@ -367,7 +367,7 @@ class BarrettArm(Arm):
         stat = setup.PropertyPort(bus.link)
         for puck in bus.codec.pucks:
             if puck.stat == Status.ERROR and self._found is not None:
-                stat.link.send(put(puck.node, self._found.motors.number("STAT"), Status.READY))
+                stat.link.send(set_frame(puck.node, self._found.motors.number("STAT"), Status.READY))
         until_ns = self.clock.now_ns() + round(_RESET * 1e9)
         while any(puck.stat == Status.ERROR for puck in bus.codec.pucks) and self.clock.now_ns() < until_ns:
             bus.cycle(None)
@@ -460,10 +460,10 @@ class BarrettArm(Arm):
     @staticmethod
     def _ask_whether_idle(bus: PuckBus, motors: Properties) -> None:
         """Ask all pucks for MODE, and those that have not said IDLE for STAT: one that has restarted knows no MODE."""
-        bus.link.send(get(Group.ARM, motors.number("MODE"), group=True))
+        bus.link.send(get_frame(Group.ARM, motors.number("MODE"), group=True))
         for puck in bus.codec.pucks:
             if puck.mode == Mode.TORQUE:
-                bus.link.send(get(puck.node, motors.number("STAT")))
+                bus.link.send(get_frame(puck.node, motors.number("STAT")))
 
     _port: setup.PropertyPort | None = None
 
@@ -491,7 +491,7 @@ class BarrettArm(Arm):
         nearest = zip(self._coordinates.zero, bus.codec.pucks, strict=True)
         self._unwrapped = [zero + puck.position for zero, puck in nearest]  # 22 bits are 512 turns: no arm wraps
         self._checks += self._joint_encoders.checks(bus.codec.pucks)
-        self._joint_encoders.begin(bus.codec.pucks, self._coordinates.positions(self._unwrapped))
+        self._joint_encoders.set_origins(bus.codec.pucks, self._coordinates.positions(self._unwrapped))
         bus.codec.forget_events()
         bus.lost = 0
 
@@ -533,7 +533,7 @@ class BarrettArm(Arm):
             bus.cycle(zero, asks_safety=True)
             self._require_sound()
         if self._found is not None:
-            bus.link.send(get(Group.ARM, self._found.motors.number("MODE"), group=True))
+            bus.link.send(get_frame(Group.ARM, self._found.motors.number("MODE"), group=True))
         for _ in range(max(_FAREWELL, round(_RAISED / period))):
             if all(status & AxisStatus.POWERED for status in self.drive_status()):
                 return
@@ -570,14 +570,14 @@ class BarrettArm(Arm):
     def _lower(self, bus: PuckBus) -> None:
         """Send IDLE to everybody, every frame on its own; never raises."""
         self._untold = False
-        for frame in () if self._found is None else setup.lowering(self._found):
+        for frame in () if self._found is None else setup.idle_frames(self._found):
             try:
                 bus.link.send(frame)
             except Exception:  # noqa: BLE001 - whatever the link died of, it is tried again
                 self._untold = True
 
     def _require_reachable(self, found: setup.FoundArm) -> None:
-        if lost := setup.unreachable(found):
+        if lost := setup.nodes_without_group(found):
             wrong = [str(one) for one in setup.checks(found) if not one.good]
             nodes = ", ".join(map(str, lost))
             raise DriverError(f"no group frame reaches pucks {nodes}: {'; '.join(wrong)}")

@@ -261,28 +261,28 @@ class Position:
     encoder: int | None = None
 
 
-def get(destination: int, number: int, *, group: bool = False) -> Frame:
+def get_frame(destination: int, property_number: int, *, group: bool = False) -> Frame:
     """Return the frame that asks a puck, or a group of pucks, for a property."""
-    return Frame(Address(HOST, destination, group).identifier, bytes([number & 0x7F]))
+    return Frame(Address(HOST, destination, group).identifier, bytes([property_number & 0x7F]))
 
 
-def put(destination: int, number: int, value: int, *, group: bool = False, sender: int = HOST) -> Frame:
+def set_frame(destination: int, property_number: int, value: int, *, group: bool = False, sender: int = HOST) -> Frame:
     """Return the frame that sets a property: 6 bytes for a value of any size, as libbarrett and OWD send.
 
     Raises:
         DriverError: a value that 32 bits do not hold.
     """
     if not -(1 << 31) <= value < 1 << 31:
-        raise DriverError(f"property {number}: {value} does not fit 32 bits")
-    data = bytes([_SET | number & 0x7F, 0]) + value.to_bytes(4, "little", signed=True)
+        raise DriverError(f"property {property_number}: {value} does not fit 32 bits")
+    data = bytes([_SET | property_number & 0x7F, 0]) + value.to_bytes(4, "little", signed=True)
     return Frame(Address(sender, destination, group).identifier, data)
 
 
-def reply(node: int, number: int, value: int, *, wide: bool) -> Frame:
+def reply_frame(node: int, property_number: int, value: int, *, wide: bool) -> Frame:
     """Return the frame by which a puck answers a GET: 6 bytes for a value of 32 bits, else 4."""
     size = 4 if wide else 2
     bits = value & (1 << 8 * size) - 1
-    data = bytes([_SET | number & 0x7F, 0]) + bits.to_bytes(size, "little")
+    data = bytes([_SET | property_number & 0x7F, 0]) + bits.to_bytes(size, "little")
     return Frame(Address(node, Group.PROPERTIES, group=True).identifier, data)
 
 
@@ -327,12 +327,12 @@ def _position(data: bytes) -> int:
     return bits - (1 << POSITION_BITS) if bits >> POSITION_BITS - 1 else bits
 
 
-def torque_frame(group: int, number: int, counts: Sequence[int]) -> Frame:
+def torque_frame(group_number: int, property_number: int, counts: Sequence[int]) -> Frame:
     """Return the frame that carries up to four torques to a group.
 
     Args:
-        group: `Group.LOWER` or `Group.UPPER`.
-        number: number of the property T in the pucks' firmware, the same in all of them.
+        group_number: `Group.LOWER` or `Group.UPPER`.
+        property_number: number of the property T in the pucks' firmware, the same in all of them.
         counts: torque of the pucks by their slots (PIDX); slots that are left out get zero.
 
     Raises:
@@ -344,8 +344,8 @@ def torque_frame(group: int, number: int, counts: Sequence[int]) -> Frame:
     for slot in range(_SLOTS):
         count = counts[slot] if slot < len(counts) else 0
         packed = packed << _TORQUE_BITS | count & (1 << _TORQUE_BITS) - 1
-    data = bytes([_SET | number & 0x7F]) + packed.to_bytes(7, "big")
-    return Frame(Address(HOST, group, group=True).identifier, data)
+    data = bytes([_SET | property_number & 0x7F]) + packed.to_bytes(7, "big")
+    return Frame(Address(HOST, group_number, group=True).identifier, data)
 
 
 def torques_of(data: bytes) -> tuple[int, tuple[int, int, int, int]] | None:

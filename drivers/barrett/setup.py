@@ -40,8 +40,8 @@ from drivers.barrett.protocol import (
     Status,
     address_of,
     decoded,
-    get,
-    put,
+    get_frame,
+    set_frame,
 )
 from drivers.can.bus_state import ControllerState, controller_state
 from drivers.can.can_frame import Frame
@@ -76,43 +76,43 @@ class PropertyPort:
         self.clock = link.clock
         self.controller = ControllerState.ACTIVE
 
-    def ask(self, node: int, number: int) -> int | None:
+    def ask(self, node: int, property_number: int) -> int | None:
         """Return the value of a property; None where no answer comes within a few tries.
 
         Args:
             node: of the puck.
-            number: of the property.
+            property_number: of the property.
         """
         for _ in range(_TRIES):
-            self.link.send(get(node, number))
+            self.link.send(get_frame(node, property_number))
             until_ns = self.clock.now_ns() + round(TIMEOUT * 1e9)
             while (frame := self._received(until_ns)) is not None:
                 answer = decoded(frame)
-                if isinstance(answer, Reply) and (answer.node, answer.number) == (node, number):
+                if isinstance(answer, Reply) and (answer.node, answer.number) == (node, property_number):
                     return answer.value
         return None
 
-    def read(self, node: int, properties: Properties, name: str) -> int:
+    def read(self, node: int, properties: Properties, property_name: str) -> int:
         """Return the value of a property; raises DriverError where no answer comes."""
-        value = self.ask(node, properties.number(name))
+        value = self.ask(node, properties.number(property_name))
         if value is None:
-            raise DriverError(f"puck {node} does not answer for {name}; check power, cable and bit rate")
+            raise DriverError(f"puck {node} does not answer for {property_name}; check power, cable and bit rate")
         return value
 
-    def write(self, node: int, properties: Properties, name: str, value: int, *, verify: bool = True) -> None:
+    def write(self, node: int, properties: Properties, property_name: str, value: int, *, verify: bool = True) -> None:
         """Set a property, wait a moment, and read it back if `verify`; DriverError where it holds another value.
 
         Raises:
             DriverError: it does not answer, or holds another value then.
         """
-        self.link.send(put(node, properties.number(name), value))
+        self.link.send(set_frame(node, properties.number(property_name), value))
         self.pause(_APART)
-        if verify and (found := self.read(node, properties, name)) != value:
-            raise DriverError(f"puck {node}: {name} is {found} after {value} was written")
+        if verify and (found := self.read(node, properties, property_name)) != value:
+            raise DriverError(f"puck {node}: {property_name} is {found} after {value} was written")
 
     def positions(self, properties: Properties, nodes: Iterable[int]) -> dict[int, int]:
         """Request the positions of the whole arm with one frame; return those that come in time [counts], by node."""
-        self.link.send(get(Group.ARM, properties.number("P"), group=True))
+        self.link.send(get_frame(Group.ARM, properties.number("P"), group=True))
         wanted, found = set(nodes), dict[int, int]()
         until_ns = self.clock.now_ns() + round(TIMEOUT * 1e9)
         while wanted - set(found) and (frame := self._received(until_ns)) is not None:
@@ -206,7 +206,7 @@ class FoundArm:
         return self.pucks[0].properties
 
 
-def found_on(port: PropertyPort, driver: BarrettDriver, *, wakes: bool = True) -> FoundArm:
+def read_pucks(port: PropertyPort, driver: BarrettDriver, *, wakes: bool = True) -> FoundArm:
     """Read version, role and settings of every puck of an arm, after waking those asleep if `wakes`.
 
     Args:
@@ -297,7 +297,7 @@ def checks(arm: FoundArm) -> tuple[SetupCheck, ...]:
     return tuple(found)
 
 
-def unreachable(arm: FoundArm) -> list[int]:
+def nodes_without_group(arm: FoundArm) -> list[int]:
     """Return the nodes of pucks that lack the whole arm's group, or the group of their torque frame."""
     return [
         one.puck.node for one in arm.pucks if not {Group.ARM, one.puck.group} <= {one.values[name] for name in _GROUPS}
@@ -308,7 +308,7 @@ def _listed(numbers: Sequence[int]) -> str:
     return " ".join(str(int(number)) for number in numbers)
 
 
-def limit(port: PropertyPort, arm: FoundArm, driver: BarrettDriver) -> None:
+def write_safety_limits(port: PropertyPort, arm: FoundArm, driver: BarrettDriver) -> None:
     """Write velocity and torque limits, and warnings below them, to the safety puck, which keeps them until power off.
 
     Raises:
@@ -330,17 +330,17 @@ def is_zeroed(port: PropertyPort, arm: FoundArm) -> bool:
     return port.read(arm.safety_node, arm.safety, "ZERO") == 1
 
 
-def lowering(arm: FoundArm) -> tuple[Frame, Frame]:
+def idle_frames(arm: FoundArm) -> tuple[Frame, Frame]:
     """Return the two frames that take all motor pucks and the safety puck to IDLE."""
     mode = _FIXED.number("MODE")
-    return put(Group.ALL, mode, Mode.IDLE, group=True), put(arm.safety_node, mode, SafetyMode.IDLE)
+    return set_frame(Group.ALL, mode, Mode.IDLE, group=True), set_frame(arm.safety_node, mode, SafetyMode.IDLE)
 
 
 _REST_SECONDS = 0.2
 _REST_COUNTS = 8  # of a motor in that time: it stands, or its encoder is between two counts
 
 
-def zero(port: PropertyPort, arm: FoundArm, coordinates: Coordinates, home: Sequence[float]) -> tuple[str, ...]:
+def write_home(port: PropertyPort, arm: FoundArm, coordinates: Coordinates, home: Sequence[float]) -> tuple[str, ...]:
     """Write the home into the pucks as the position of the resting arm, and return in words what each got.
 
     Args:

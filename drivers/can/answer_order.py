@@ -26,7 +26,7 @@ class AnswerOrder:
 
     Attributes:
         behind: number of requests that wait for an answer, the latest included.
-        uncertain: whether the last answer may be of an older request, and `settle` is to be called.
+        uncertain: whether the last answer may be of an older request, and `believe_uncertain` is to be called.
     """
 
     __slots__ = ("_doubted", "_earliest_ns", "_latest_ns", "_margin_ns", "behind", "uncertain")
@@ -39,11 +39,11 @@ class AnswerOrder:
         self._earliest_ns: int | None = None  # that an answer took so far, where it could only be this cycle's
         self._latest_ns = 0
 
-    def take(self, delay_ns: int | None) -> int | None:
+    def take_answer(self, delay_since_request_ns: int | None) -> int | None:
         """Count an answer; return how many requests old it may be, 0 if surely the latest's, None if none was open.
 
         Args:
-            delay_ns: time since the latest request [ns]; None where it is unknown.
+            delay_since_request_ns: time since the latest request [ns]; None where it is unknown.
 
         Returns:
             How many requests ago the one was that it may belong to, 0 where it surely is the latest; None where every
@@ -53,25 +53,25 @@ class AnswerOrder:
             return None
         self.behind -= 1
         if self.behind:
-            self.uncertain = not self._is_usual(delay_ns)
+            self.uncertain = not self._is_usual(delay_since_request_ns)
             if not self.uncertain:
                 self.behind = self._doubted = 0
             return self.behind
         self.uncertain, self._doubted = False, 0
-        if delay_ns is not None:
+        if delay_since_request_ns is not None:
             if self._earliest_ns is None:
-                self._earliest_ns = self._latest_ns = delay_ns
-            elif delay_ns < self._earliest_ns:
-                self._earliest_ns = delay_ns
-            elif delay_ns > self._latest_ns:
-                self._latest_ns = delay_ns
+                self._earliest_ns = self._latest_ns = delay_since_request_ns
+            elif delay_since_request_ns < self._earliest_ns:
+                self._earliest_ns = delay_since_request_ns
+            elif delay_since_request_ns > self._latest_ns:
+                self._latest_ns = delay_since_request_ns
         return 0
 
     def take_late(self) -> None:
         """Count an answer outside of every cycle: one request fewer waits for its answer."""
         self.behind = max(0, self.behind - 1)
 
-    def settle(self) -> bool:
+    def believe_uncertain(self) -> bool:
         """Return at a cycle's end whether an uncertain answer counts as the latest request's: the first two do."""
         self.uncertain = False
         self._doubted += 1
@@ -101,21 +101,21 @@ class AnsweringNode(Protocol):
     order: AnswerOrder
 
 
-def settle_uncertain(nodes: Iterable[AnsweringNode], tell: Callable[[EventCode, int, str], None]) -> int:
+def settle_uncertain(nodes: Iterable[AnsweringNode], on_late: Callable[[EventCode, int, str], None]) -> int:
     """Count uncertain answers at a cycle's end as the latest request's, or late; return how many were the latest's.
 
     Args:
         nodes: of one bus.
-        tell: called with the other nodes, whose answers are late.
+        on_late: called with the other nodes, whose answers are late.
     """
     settled = 0
     for one in nodes:
         if not one.order.uncertain:
             continue
-        if one.order.settle():
+        if one.order.believe_uncertain():
             one.answered, one.age = True, 0
             settled += 1
         else:
             one.late += 1
-            tell(EventCode.LATE, one.node, f"its position is {one.age} cycles old")
+            on_late(EventCode.LATE, one.node, f"its position is {one.age} cycles old")
     return settled

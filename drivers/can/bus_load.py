@@ -48,32 +48,34 @@ class Bits(NamedTuple):
         return self.nominal / bitrate + (self.data / data_bitrate if data_bitrate is not None else 0.0)
 
 
-def padded(length: int) -> int:
+def padded_length(least_length: int) -> int:
     """Return the shortest CAN FD length that holds so many bytes; raises ValueError above 64."""
     for longer in FD_LENGTHS:
-        if longer >= length:
+        if longer >= least_length:
             return longer
-    raise ValueError(f"a frame of CAN FD has at most 64 bytes, not {length}")
+    raise ValueError(f"a frame of CAN FD has at most 64 bytes, not {least_length}")
 
 
-def unstuffed(length: int, *, fd: bool = False) -> Bits:
+def unstuffed_bits(data_length: int, *, fd: bool = False) -> Bits:
     """Return the bits of an 11-bit identifier's data frame without stuffing; ValueError for a length no frame has."""
     if not fd:
-        return Bits(_classical(length) + _TAIL)
-    return Bits(_FD_ARBITRATION + _TAIL, _FD_CONTROL + 8 * padded(length) + _fd_checksum(padded(length)))
+        return Bits(_classical(data_length) + _TAIL)
+    return Bits(
+        _FD_ARBITRATION + _TAIL, _FD_CONTROL + 8 * padded_length(data_length) + _fd_checksum(padded_length(data_length))
+    )
 
 
-def worst(length: int, *, fd: bool = False) -> Bits:
+def most_bits(data_length: int, *, fd: bool = False) -> Bits:
     """Return the most bits of an 11-bit identifier's data frame with so many bytes; ValueError for a wrong length."""
-    plain = unstuffed(length, fd=fd)
+    plain = unstuffed_bits(data_length, fd=fd)
     if not fd:
-        return Bits(plain.nominal + (_classical(length) - 1) // 4)
-    stuffable = _FD_ARBITRATION + _FD_CONTROL + 8 * padded(length)
+        return Bits(plain.nominal + (_classical(data_length) - 1) // 4)
+    stuffable = _FD_ARBITRATION + _FD_CONTROL + 8 * padded_length(data_length)
     early = (_FD_ARBITRATION - 1) // 4
     return Bits(plain.nominal + early, plain.data + (stuffable - 2) // 4 - early)
 
 
-def exact(frame: Frame, *, fd: bool = False) -> Bits:
+def exact_bits(frame: Frame, *, fd: bool = False) -> Bits:
     """Return the bits of one frame with this content; raises ValueError for a length no frame has.
 
     Error frames are the controller's and not on the wire: 0 bits. Remote frames count as asking for no data.
@@ -95,17 +97,17 @@ def exact(frame: Frame, *, fd: bool = False) -> Bits:
     return Bits(count + _stuffed(value, count) + _TAIL)
 
 
-def crc15(value: int, count: int) -> int:
-    """Return the CRC-15 of the lowest `count` bits, first bit highest (ISO 11898-1:2015, 10.4.2.6)."""
+def crc15(value: int, bit_count: int) -> int:
+    """Return the CRC-15 of the lowest `bit_count` bits, first bit highest (ISO 11898-1:2015, 10.4.2.6)."""
     crc = 0
     # Leading zeros leave a CRC that starts at 0 as it is.
-    for byte in value.to_bytes((count + 7) // 8, "big"):
+    for byte in value.to_bytes((bit_count + 7) // 8, "big"):
         crc = (crc << 8 & 0x7FFF) ^ _CRC[(crc >> 7) ^ byte]
     return crc
 
 
 def _exact_fd(frame: Frame) -> Bits:
-    length = padded(len(frame.data))
+    length = padded_length(len(frame.data))
     # Start 0, identifier, RRS 0, IDE 0, FDF 1, res 0, BRS 1, ESI 0, DLC; padding is zeros.
     head = (frame.identifier & 0x7FF) << 10 | 0b101 << 5 | FD_LENGTHS.index(length)
     value = head << 8 * length | int.from_bytes(frame.data, "big") << 8 * (length - len(frame.data))
@@ -113,7 +115,7 @@ def _exact_fd(frame: Frame) -> Bits:
     early = _stuffed(value >> count - _FD_ARBITRATION, _FD_ARBITRATION)
     # What would be stuffed after the last bit is the fixed stuff bit before the stuff count.
     every = _stuffed(value, count) - _run_ends(value, count)
-    plain = unstuffed(length, fd=True)
+    plain = unstuffed_bits(length, fd=True)
     return Bits(plain.nominal + early, plain.data + every - early)
 
 
@@ -296,7 +298,7 @@ class Budget:
     def reason(self) -> str:
         """Describe in words which buses are over budget; empty where none is."""
         return "; ".join(
-            f"bus {bus.number} ({bus.bus.channel}) is over budget at {self.rate:g} Hz: {shares(bus)}"
+            f"bus {bus.number} ({bus.bus.channel}) is over budget at {self.rate:g} Hz: {load_text(bus)}"
             for bus in self.buses
             if not bus.fits
         )
@@ -313,10 +315,10 @@ DRAWN = 256  # frames behind one mean
 def line_of(
     name: str,
     identifiers: Sequence[int],
-    length: int,
+    data_length: int,
     per_second: float,
     bus: CanBus,
-    mean: Callable[[int], tuple[float, float]],
+    mean_bits_of: Callable[[int], tuple[float, float]],
     *,
     cyclic: bool = False,
 ) -> Line:
@@ -325,38 +327,45 @@ def line_of(
     Args:
         name: name of the sort of frames.
         identifiers: identifiers, one for each frame.
-        length: bytes of one.
+        data_length: bytes of one.
         per_second: largest number of each per second.
         bus: bus that the frames are on.
-        mean: function that returns the mean bits of a frame by its identifier, at the nominal and at the data bit rate.
+        mean_bits_of: function that returns the mean bits of a frame by its identifier, at the nominal and at the data
+            bit rate.
         cyclic: whether each is sent once a cycle.
     """
     fd, rates = bus.data_bitrate is not None, (bus.bitrate, bus.data_bitrate)
     costs = []
     for identifier in identifiers:
-        nominal, data = mean(identifier)
+        nominal, data = mean_bits_of(identifier)
         typical = nominal / bus.bitrate + (data / bus.data_bitrate if bus.data_bitrate is not None else 0.0)
-        costs.append(Cost(unstuffed(length, fd=fd).seconds(*rates), typical, worst(length, fd=fd).seconds(*rates)))
-    return Line(name, tuple(identifiers), length, per_second, cyclic, sum_of(costs).times(1.0 / len(costs)))
+        costs.append(
+            Cost(
+                unstuffed_bits(data_length, fd=fd).seconds(*rates),
+                typical,
+                most_bits(data_length, fd=fd).seconds(*rates),
+            )
+        )
+    return Line(name, tuple(identifiers), data_length, per_second, cyclic, sum_of(costs).times(1.0 / len(costs)))
 
 
-def mean_bits(identifier: int, draw: Callable[[random.Random], bytes], *, fd: bool = False) -> tuple[float, float]:
+def mean_bits(identifier: int, draw_data: Callable[[random.Random], bytes], *, fd: bool = False) -> tuple[float, float]:
     """Return the mean bits of a frame over typical contents, at both bit rates; the same on every call.
 
     Args:
         identifier: identifier of the frame, which seeds the draws, too.
-        draw: function that draws the content of one frame.
+        draw_data: function that draws the content of one frame.
         fd: whether it is a CAN FD frame.
     """
     source = random.Random(identifier)  # noqa: S311 - values, not secrets
     nominal = data = 0
     for _ in range(DRAWN):
-        bits = exact(Frame(identifier, draw(source)), fd=fd)
+        bits = exact_bits(Frame(identifier, draw_data(source)), fd=fd)
         nominal, data = nominal + bits.nominal, data + bits.data
     return nominal / DRAWN, data / DRAWN
 
 
-def shares(bus: BusLoad) -> str:
+def load_text(bus: BusLoad) -> str:
     """Return the worst and the typical load of a bus in words [%]."""
     return f"{100 * bus.load.worst:.1f} % worst, {100 * bus.load.typical:.1f} % typical"
 

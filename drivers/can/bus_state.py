@@ -75,15 +75,15 @@ class BusError(DriverError):
         super().__init__(f"{name}: {remedy or _REMEDY[kind].format(name=name, bitrate=bitrate)}{said}")
 
 
-def kind_of(code: int | None, otherwise: Kind = "refused") -> Kind:
-    """Return the kind of bus error that an errno means; `otherwise` for None and for any other errno.
+def kind_of(errno_value: int | None, default: Kind = "refused") -> Kind:
+    """Return the kind of bus error that an errno means; `default` for None and for any other errno.
 
     Args:
-        code: the errno, None where there is none.
-        otherwise: kind of any other errno; `gone` says that the bus is in use, so that it existed before.
+        errno_value: the errno, None where there is none.
+        default: kind of any other errno; `gone` says that the bus is in use, so that it existed before.
     """
-    kind = _KINDS.get(code or 0, otherwise)
-    return "gone" if (kind, otherwise) == ("absent", "gone") else kind
+    kind = _KINDS.get(errno_value or 0, default)
+    return "gone" if (kind, default) == ("absent", "gone") else kind
 
 
 class BusOffWatch:

@@ -52,19 +52,19 @@ def require_format(path: Path | str) -> Path:
     return Path(path)
 
 
-def logged_links(links: Sequence[Link], path: Path, fd: Sequence[bool]) -> tuple[SessionLog, list[Link]]:
+def logged_links(links: Sequence[Link], log_file: Path, fd: Sequence[bool]) -> tuple[SessionLog, list[Link]]:
     """Wrap open links so that their frames go into a new file; returns its log, to be closed after them, and the links.
 
     Args:
         links: of all buses.
-        path: of the file.
+        log_file: of the file.
         fd: whether the data frames of each bus are sent as CAN FD's.
 
     Raises:
         DriverError: the file cannot be created; the links are closed then.
     """
     try:
-        log = SessionLog(path, links[0].clock)
+        log = SessionLog(log_file, links[0].clock)
     except BaseException:
         for link in links:
             link.close()
@@ -189,7 +189,7 @@ class SessionLog:
         return LoggedLink(link, self, bus, fd)
 
     def close(self) -> None:
-        """Finish the file and set `report`; any number of times."""
+        """Wait, a minute at most, until the writing process has finished the file, and set `report`."""
         if self.report is not None:
             return
         with suppress(OSError):

@@ -45,7 +45,7 @@ class CandumpWriter(CanutilsLogWriter):
             super().on_message_received(msg)
 
 
-def message(frame: Frame, bus: int, sent: bool, utc_offset_ns: int) -> can.Message:
+def to_can_message(frame: Frame, bus: int, sent: bool, utc_offset_ns: int) -> can.Message:
     """Convert a frame to the message that python-can's writers take."""
     return can.Message(
         timestamp=(frame.stamp_ns + utc_offset_ns) * 1e-9,
@@ -99,7 +99,7 @@ class OrderedLog:
         count = 0
         while self._heap and (stamp_ns is None or self._heap[0][0] <= stamp_ns):
             _, _, frame, bus, sent = heapq.heappop(self._heap)
-            self._writer.on_message_received(message(frame, bus, sent, self._utc_offset_ns))
+            self._writer.on_message_received(to_can_message(frame, bus, sent, self._utc_offset_ns))
             count += 1
         if count:
             self._writer.file.flush()

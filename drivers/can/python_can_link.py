@@ -85,14 +85,14 @@ def open_bus(bus: CanBus, **more: Any) -> can.BusABC:
         quiet.setLevel(before)
 
 
-def bus_error(error: Exception, bus: CanBus, otherwise: Kind = "gone") -> BusError:
+def bus_error(error: Exception, bus: CanBus, default: Kind = "gone") -> BusError:
     """Convert an error of python-can or of the system to a BusError with a remedy."""
     code = getattr(error, "error_code", None) or getattr(error, "errno", None)
     if code is None and isinstance(error.__cause__, OSError):
         code = error.__cause__.errno
     if code is None and "Transmit buffer full" in str(error):  # socketcan's, which carries no number
         code = errno.ENOBUFS
-    kind = otherwise if isinstance(error, can.CanInterfaceNotImplementedError) else kind_of(code, otherwise)
+    kind = default if isinstance(error, can.CanInterfaceNotImplementedError) else kind_of(code, default)
     return BusError(kind, bus.channel, bus.bitrate, f"{bus.interface}: {error}")
 
 

@@ -14,7 +14,7 @@ import random
 from collections.abc import Callable, Iterator
 from functools import lru_cache
 
-from drivers.can.bus_load import ROUND_RATES, Budget, BusLoad, Line, line_of, mean_bits, shares
+from drivers.can.bus_load import ROUND_RATES, Budget, BusLoad, Line, line_of, load_text, mean_bits
 from drivers.canopen import object_dictionary as od
 from drivers.canopen.cia402 import NmtState
 from drivers.canopen.object_dictionary import Entry, Kind
@@ -66,15 +66,15 @@ def budget(driver: CanopenDriver, rate: float) -> Budget:
 def frame_line(
     name: str,
     cob_ids: tuple[int, ...],
-    slots: tuple[Entry, ...],
+    entries: tuple[Entry, ...],
     per_second: float,
     bus: CanBus,
     *,
     cyclic: bool = False,
 ) -> Line:
-    """Return the line of frames with these contents: their cost on a bus; `slots` decide length and typical values."""
-    length, fd = sum(slot.kind.size for slot in slots), bus.data_bitrate is not None
-    return line_of(name, cob_ids, length, per_second, bus, lambda one: _mean_bits(one, slots, fd), cyclic=cyclic)
+    """Return the line of frames with these contents: their cost on a bus; `entries` decide length and typical bits."""
+    length, fd = sum(slot.kind.size for slot in entries), bus.data_bitrate is not None
+    return line_of(name, cob_ids, length, per_second, bus, lambda one: _mean_bits(one, entries, fd), cyclic=cyclic)
 
 
 @lru_cache(maxsize=512)
@@ -107,7 +107,7 @@ def _lines(profile: BusProfile) -> Iterator[Line]:
     yield _line(profile, name, tuple(TPDO1 + n for n in nodes), profile.position_slots, rate, cyclic=True)
     if status := profile.status_slots:
         yield _line(profile, "status reports", tuple(TPDO2 + n for n in nodes), status, 1.0 / profile.status_inhibit)
-    guarded = tuple(HEARTBEAT + n for n in profile.guarded)
+    guarded = tuple(HEARTBEAT + n for n in profile.guarded_nodes)
     if beats := tuple(HEARTBEAT + n for n in nodes if HEARTBEAT + n not in guarded):
         yield _line(profile, "heartbeats of the drives", beats, (HEARTBEAT_STATE,), 1.0 / profile.heartbeat_drives)
     if guarded:
@@ -159,4 +159,4 @@ def _variants(driver: CanopenDriver) -> Iterator[tuple[str, CanopenDriver]]:
 
 
 def _left(other: Budget) -> str:
-    return shares(max(other.buses, key=lambda bus: bus.load.worst))
+    return load_text(max(other.buses, key=lambda bus: bus.load.worst))

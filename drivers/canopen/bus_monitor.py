@@ -17,7 +17,7 @@ import numpy as np
 
 from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector
 from drivers.axis_status import AxisStatus
-from drivers.can.bus_load import worst
+from drivers.can.bus_load import most_bits
 from drivers.can.can_frame import Frame
 from drivers.can.can_link import BusLock, Link
 from drivers.canopen import object_dictionary as od
@@ -85,21 +85,21 @@ class BusListener:
             for frame in link.drain():
                 self.take(bus, frame)
 
-    def nmt_words(self, place: Place, now_ns: int, patience_ns: int) -> str:
+    def nmt_words(self, bus_and_node: Place, now_ns: int, heartbeat_timeout_ns: int) -> str:
         """Describe a node's NMT state as heard last, and whether its heartbeat is missing by now, in words.
 
         Args:
-            place: bus and node number.
+            bus_and_node: bus and node number.
             now_ns: present time of the links' clock [ns].
-            patience_ns: time without a heartbeat that was there after which it is missed [ns].
+            heartbeat_timeout_ns: time without a heartbeat that was there after which it is missed [ns].
         """
-        if place not in self.nmt:
+        if bus_and_node not in self.nmt:
             return "sends no heartbeat"
-        state, stamp_ns = self.nmt[place]
-        if place in self.booted:
+        state, stamp_ns = self.nmt[bus_and_node]
+        if bus_and_node in self.booted:
             return f"{nmt_words(state)} since it booted"
         words = nmt_words(state)
-        return f"{words}, heartbeat missing" if now_ns - stamp_ns > patience_ns else words
+        return f"{words}, heartbeat missing" if now_ns - stamp_ns > heartbeat_timeout_ns else words
 
 
 RATE = 20.0  # Hz
@@ -123,7 +123,7 @@ class _LastAnswers:
 
 def look_rate(driver: CanopenDriver) -> float:
     """Return the rate at which all drives are asked [Hz]: `RATE`, or less where that takes `SHARE` of a bus."""
-    frames = 2 * len(_QUESTIONS) * sum(worst(_SDO_BYTES))
+    frames = 2 * len(_QUESTIONS) * sum(most_bits(_SDO_BYTES))
     loads = [
         frames * sum(drive.bus == number for drive in driver.drives) / bus.bitrate
         for number, bus in enumerate(driver.buses)
@@ -292,16 +292,16 @@ class MonitoringArm(Arm):
             return
         self._heard.restarted.clear()
         answers = [k for k in range(len(self._places)) if k not in self._missing]
-        held = {k: self._zeros.held(self._objects(k), k) for k in answers}
+        held = {k: self._zeros.stored_counts(self._objects(k), k) for k in answers}
         if lost := [self._places[k][1] for k, counts in held.items() if counts is None]:
-            raise PositionUnknown(self._zeros.lost(lost))
+            raise PositionUnknown(self._zeros.lost_text(lost))
         counts = [held.get(k) or 0 for k in range(len(self._places))]
         self._coordinates = self._coordinates.zeroed(counts, self._zeros.home)
 
     def _require_no_restart(self) -> None:
         ours = self._heard.restarted.intersection(self._places)
         if self._zeros is not None and ours:
-            raise PositionUnknown(self._zeros.lost([node for _, node in ours]))
+            raise PositionUnknown(self._zeros.lost_text([node for _, node in ours]))
 
     def _objects(self, number: int) -> Objects:
         bus, node = self._places[number]

@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from drivers.can.bus_load import worst
+from drivers.can.bus_load import most_bits
 from drivers.can.bus_state import BusError
 from drivers.can.can_frame import Frame
 from drivers.can.can_link import BusLock, Link, open_links
@@ -82,12 +82,12 @@ def scan(config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_l
     Raises:
         DriverError: another driver, a bus that is in use, by another host too, or that cannot be had.
     """
-    with asking(config, open_bus) as (driver, links, listener):
+    with buses_to_ask(config, open_bus) as (driver, links, listener):
         return _found(driver, links, listener)
 
 
 @contextmanager
-def asking(
+def buses_to_ask(
     config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_links
 ) -> Iterator[tuple[CanopenDriver, list[Link], BusListener]]:
     """Open the buses of an arm exclusively, listen for a second, and yield driver section, links and listener.
@@ -131,7 +131,7 @@ def _found(driver: CanopenDriver, links: list[Link], listener: BusListener) -> l
 
     everybody = {(bus, node) for bus in range(len(links)) for node in NODES}
     bursts = -(-len(NODES) // BURST)
-    wire = 2 * BURST * sum(worst(_SDO_BYTES)) / min(bus.bitrate for bus in driver.buses)
+    wire = 2 * BURST * sum(most_bits(_SDO_BYTES)) / min(bus.bitrate for bus in driver.buses)
     kinds = answering(everybody, bursts * (PATIENCE + wire))
     doubtful = {*listener.nmt, *listener.answered, *((drive.bus, drive.node) for drive in driver.drives)} - kinds.keys()
     if doubtful:
@@ -181,7 +181,7 @@ def _read(node: FoundNode, objects: Objects) -> None:
     node.name, node.firmware = text(od.DEVICE_NAME_INDEX, "device name"), text(od.FIRMWARE_INDEX, "software version")
     node.error_register = number(od.ERROR_REGISTER)
     count = number(od.ERROR_COUNT) or 0
-    latest = (number(od.LAST_ERROR.at(sub)) for sub in range(1, min(count, _HISTORY) + 1))
+    latest = (number(od.LAST_ERROR.at_sub_index(sub)) for sub in range(1, min(count, _HISTORY) + 1))
     node.history = tuple(entry for entry in latest if entry is not None)
     if node.is_drive:
         node.status, node.last_error = number(od.STATUS_WORD), number(od.LAST_EMERGENCY)

@@ -40,16 +40,16 @@ def shipped_families() -> tuple[Family, ...]:
     return tuple(family_from(path.name, path.read_text(encoding="utf-8")) for path in files)
 
 
-def family_of(identity: Mapping[str, int], own: Sequence[Family] = ()) -> Family:
+def family_of(identity: Mapping[str, int], own_families: Sequence[Family] = ()) -> Family:
     """Return the family of a drive by vendor and product, or the generic one, which also fills what it leaves open.
 
     Args:
         identity: values of 1018h, by the keys `vendor` and `product`.
-        own: families of the arm's description, which count before the shipped ones.
+        own_families: families of the arm's description, which count before the shipped ones.
     """
     vendor, product = identity.get("vendor"), identity.get("product")
     *shipped, generic = shipped_families()
-    makers = [one for one in (*own, *shipped) if one.match.vendor is not None and one.match.vendor == vendor]
+    makers = [one for one in (*own_families, *shipped) if one.match.vendor is not None and one.match.vendor == vendor]
     exact = [one for one in makers if product in one.match.product]
     found = [*exact, *(one for one in makers if not one.match.product)]
     return found[0].over(generic) if found else generic
@@ -194,12 +194,12 @@ class Capabilities:
     def summary(self) -> str:
         """Describe in one line the drive's family, torque mode, count, limits, watchdogs and status reports."""
         unknown = "unknown"
-        torque = unknown if self.torque is None else f"mode {self.torque.mode} by {named(self.torque.target)}"
+        torque = unknown if self.torque is None else f"mode {self.torque.mode} by {readable_entry(self.torque.target)}"
         count = unknown if self.count is None else f"{self.count:.6g} N m"
         if self.family.unit is not None and self.family.unit.writable:
             count = "as described"  # from opening on: what the drive held before is gone
-        limit = unknown if self.limit is None else named(self.limit.entry)
-        speed = "none" if self.speed is None else where(self.speed)
+        limit = unknown if self.limit is None else readable_entry(self.limit.entry)
+        speed = "none" if self.speed is None else entry_text(self.speed)
         status = "with the position" if self.beside else "by timer" if self.event else "by SYNC"
         return (
             f"{self.family.name}, {torque}, a count {count}, torque limit {limit}, speed limit {speed}, "
@@ -213,43 +213,45 @@ class Capabilities:
             raise UnsuitableDrive(f"node {node}: cannot be driven ({self.family.name}): {told}")
 
 
-def capabilities(objects: Objects, driver: CanopenDriver, number: int) -> Capabilities:
+def capabilities(objects: Objects, driver: CanopenDriver, drive_index: int) -> Capabilities:
     """Read a drive's entries by SDO uploads alone; return what it can do, and its problems.
 
     Args:
         objects: of the drive.
         driver: the arm's section.
-        number: of the drive.
+        drive_index: of the drive.
 
     Raises:
         DriverError: it does not answer, or the bus is gone.
     """
-    drive = driver.drives[number]
-    family, found = discovered(objects, drive, driver.families)
-    return assess(found, family, drive, driver, driver.sheets[number])
+    drive = driver.drives[drive_index]
+    family, found = read_entries(objects, drive, driver.families)
+    return assess(found, family, drive, driver, driver.sheets[drive_index])
 
 
-def required(objects: Objects, driver: CanopenDriver, number: int) -> Capabilities:
+def require_capabilities(objects: Objects, driver: CanopenDriver, drive_index: int) -> Capabilities:
     """Return `capabilities` of a drive; raises UnsuitableDrive, with everything wrong, if it cannot be driven."""
-    can = capabilities(objects, driver, number)
+    can = capabilities(objects, driver, drive_index)
     can.require(objects.node)
     return can
 
 
-def discovered(objects: Objects, drive: CanopenDrive, own: Sequence[Family] = ()) -> tuple[Family, DriveEntries]:
+def read_entries(
+    objects: Objects, drive: CanopenDrive, own_families: Sequence[Family] = ()
+) -> tuple[Family, DriveEntries]:
     """Read all entries that matter from a drive by SDO uploads; return its family and these entries.
 
     Args:
         objects: of the drive.
         drive: section of the description for the drive.
-        own: families of the description.
+        own_families: families of the description.
 
     Raises:
         DriverError: it does not answer, or the bus is gone.
     """
     objects.read_bytes(od.DEVICE_TYPE.index, 0, od.DEVICE_TYPE.name)  # one that is silent is not asked for all the rest
     first = _read_entries(objects, (od.DEVICE_TYPE, od.VENDOR, od.PRODUCT))
-    family = family_of(first.identity, own)
+    family = family_of(first.identity, own_families)
     return family, replace(_read_entries(objects, _entries(family, drive)), firmware=_firmware(objects))
 
 
@@ -263,11 +265,11 @@ def _firmware(objects: Objects) -> str:
 
 
 def entries_from_sheet(
-    sheet: DataSheet, drive: CanopenDrive, own: Sequence[Family] = ()
+    sheet: DataSheet, drive: CanopenDrive, own_families: Sequence[Family] = ()
 ) -> tuple[Family, DriveEntries]:
-    """Return a drive's family and entries from its data sheet, without asking it; arguments as for `discovered`."""
+    """Return a drive's family and entries from its data sheet, without asking it; arguments as for `read_entries`."""
     told = {0x101800 | sub: value for sub, value in sheet.identity.items()}
-    family = family_of(DriveEntries(frozenset(), told).identity, own)
+    family = family_of(DriveEntries(frozenset(), told).identity, own_families)
     values = {key: value for key, one in sheet.entries.items() if (value := one.number(drive.node)) is not None}
     return family, DriveEntries(frozenset(sheet.entries), values | told, asked=False)
 
@@ -306,52 +308,56 @@ def _read_entries(objects: Objects, entries: Mapping[int, Entry] | Sequence[Entr
 
 
 def assess(
-    found: DriveEntries, family: Family, drive: CanopenDrive, driver: CanopenDriver, sheet: DataSheet | None
+    entries: DriveEntries, family: Family, drive: CanopenDrive, driver: CanopenDriver, sheet: DataSheet | None
 ) -> Capabilities:
     """Compare the entries that a drive has with what is needed; return its capabilities with all problems.
 
     Args:
-        found: entries that the drive has.
+        entries: entries that the drive has.
         family: drive family that it belongs to.
         drive: section of the description for the drive.
         driver: the section that has it.
         sheet: data sheet of the drive, None where none is known.
     """
-    problems = [Problem(where(entry), f"missing; {why}") for entry, why in _INDISPENSABLE if not found.has(entry)]
-    notes = [f"{where(entry)} is missing: {words}" for entry, words in _OPTIONAL if not found.has(entry)]
-    notes += [f"cannot be read: {why}" for why in found.unread.values()]
+    problems = [
+        Problem(entry_text(entry), f"missing; {why}") for entry, why in _INDISPENSABLE if not entries.has(entry)
+    ]
+    notes = [f"{entry_text(entry)} is missing: {words}" for entry, words in _OPTIONAL if not entries.has(entry)]
+    notes += [f"cannot be read: {why}" for why in entries.unread.values()]
     positions = driver.streams == "position"
     paths = ([family.position] if family.position else []) if positions else family.torque
-    torque = next((path for path in paths if _streams(path, found)), None)
-    kind = found.get(od.DEVICE_TYPE)
+    torque = next((path for path in paths if _streams(path, entries)), None)
+    kind = entries.get(od.DEVICE_TYPE)
     if kind is not None and kind & 0xFFFF != DRIVE_PROFILE:
         problems = [Problem("1000h", f"is {kind:08X}h, which is no drive of CiA 402")]
     elif torque is None:
-        problems = [Problem("6502h", _no_position(found) if positions else family.refuse or _no_torque(family, found))]
-    elif kind is None and found.asked:
+        problems = [
+            Problem("6502h", _no_position(entries) if positions else family.refuse or _no_torque(family, entries))
+        ]
+    elif kind is None and entries.asked:
         problems.insert(0, Problem("1000h", "does not report to be a drive of CiA 402"))
-    count = _count(family, found, drive)
-    limit = next((one for one in family.torque_limit if _limits(one, found)), None)
-    if found.has(od.SECOND_AXIS):
+    count = _count(family, entries, drive)
+    limit = next((one for one in family.torque_limit if _limits(one, entries)), None)
+    if entries.has(od.SECOND_AXIS):
         notes.append("6841h is there: of its axes only the first one (6041h) is driven")
-    notes += _other_limits(family, found, drive, limit)
+    notes += _other_limits(family, entries, drive, limit)
     speed, size = None, 1.0
     for entry in [parse_entry(text, "largest speed") for text in family.speed_limit]:
-        if found.has(entry) and (own := speed_size(entry, found.get(od.VELOCITY_UNIT), drive)) is not None:
+        if entries.has(entry) and (own := speed_units_per_rpm(entry, entries.get(od.VELOCITY_UNIT), drive)) is not None:
             speed, size = entry, own
             break
     if speed is None:
         notes.append("no speed limit in the drive: only the host monitors it")
-    watchdogs = tuple(_watchdogs(family, found, drive))
+    watchdogs = tuple(_watchdogs(family, entries, drive))
     changes: list[Problem] = []
     if torque is not None:
         if positions and (family.unit is None or family.unit.rated is None):
             problems.append(Problem("6077h", "nobody knows what a count of the torque that it measures is"))
-        problems += _unit_problems(family, found, count)
-        changes += _unit_changes(family, found, drive, count)
+        problems += _unit_problems(family, entries, count)
+        changes += _unit_changes(family, entries, drive, count)
         changes += _frame_changes(torque, drive)
         if limit is None:
-            tried = ", ".join(sorted({named(one.entry) for one in family.torque_limit})) or "none is known"
+            tried = ", ".join(sorted({readable_entry(one.entry) for one in family.torque_limit})) or "none is known"
             problems.append(Problem(tried, "missing; the drive itself must limit the torque"))
         if not watchdogs:
             problems.append(
@@ -360,13 +366,13 @@ def assess(
         elif drive.watchdog not in watchdogs:
             words = f"{drive.watchdog}: this drive lacks it; it has {', '.join(watchdogs)}"
             changes.append(Problem("drives.watchdog", words))
-        if driver.zero == "at_home" and not found.has(od.ZERO_COUNTS):
+        if driver.zero == "at_home" and not entries.has(od.ZERO_COUNTS):
             words = "at_home: it has no 1020h to keep a zero in; its encoder must know its position (absolute)"
             changes.append(Problem("driver.zero", words))
-        if driver.torque_reports != "none" and not found.has(od.TORQUE_ACTUAL):
+        if driver.torque_reports != "none" and not entries.has(od.TORQUE_ACTUAL):
             changes.append(Problem("driver.measured_torque", "it does not report its torque (6077h): set it to none"))
-    event, beside = found.has(pdo_entry(od.TPDO_PERIOD, 2)), driver.status_frame == "position"
-    if not (beside or found.has(pdo_entry(od.TPDO_COB_ID, 2))):
+    event, beside = entries.has(pdo_entry(od.TPDO_PERIOD, 2)), driver.status_frame == "position"
+    if not (beside or entries.has(pdo_entry(od.TPDO_COB_ID, 2))):
         words = "1801h:01 is missing, so that its status has no frame of its own: set it to position"
         changes.append(Problem("driver.status.frame", words))
     elif not (beside or event):
@@ -375,7 +381,7 @@ def assess(
     dummies = sorted((int(text, 16) for text in family.dummies or ()), key=lambda dummy: dummy not in listed)
     return Capabilities(
         family,
-        found,
+        entries,
         torque,
         count,
         limit,
@@ -393,14 +399,14 @@ def assess(
     )
 
 
-def where(entry: Entry) -> str:
+def entry_text(entry: Entry) -> str:
     """Return an entry as people write it: `6410h:02`, or `6410h` for sub-index 0."""
     return f"{entry.index:04X}h" + (f":{entry.sub:02X}" if entry.sub else "")
 
 
-def named(text: str) -> str:
+def readable_entry(text: str) -> str:
     """Rewrite a family's entry, such as `6410:2/u32`, as people write it: `6410h:02`."""
-    return where(parse_entry(text, ""))
+    return entry_text(parse_entry(text, ""))
 
 
 def _streams(path: TorquePath | PositionPath, found: DriveEntries) -> bool:
@@ -414,7 +420,7 @@ def _streams(path: TorquePath | PositionPath, found: DriveEntries) -> bool:
 def _no_torque(family: Family, found: DriveEntries) -> str:
     modes = found.get(od.SUPPORTED_MODES)
     said = "has no value" if modes is None else f"is {modes:X}h"
-    lacking = sorted({named(p.target) for p in family.torque if not found.has(parse_entry(p.target, ""))})
+    lacking = sorted({readable_entry(p.target) for p in family.torque if not found.has(parse_entry(p.target, ""))})
     return f"no torque mode: 6502h {said}" + (f", {', '.join(lacking)} missing" if lacking else "")
 
 
@@ -433,10 +439,10 @@ def _frame_changes(path: TorquePath | PositionPath, drive: CanopenDrive) -> Iter
     needed = path.shift if path.wide else None
     if drive.torque_shift != needed:
         words = "takes 16 bits: leave it out" if needed is None else f"takes 32 bits: set it to {needed}"
-        yield Problem("drives.torque_shift", f"{named(path.target)} {words}")
+        yield Problem("drives.torque_shift", f"{readable_entry(path.target)} {words}")
 
 
-def speed_size(entry: Entry, unit: int | None, drive: CanopenDrive) -> float | None:
+def speed_units_per_rpm(entry: Entry, unit: int | None, drive: CanopenDrive) -> float | None:
     """Return how many units of a speed entry one turn per minute is; None where nobody knows.
 
     Args:
@@ -468,7 +474,7 @@ def _other_limits(
         held = None if limit is chosen or limit.per else found.get(parse_entry(limit.entry, ""))
         if held is not None and limit.held(held) < most:
             share = limit.held(held) * drive.rated_torque / 1000.0
-            yield f"{named(limit.entry)} is {held}: it may keep to {share:.4g} N m, below drives.max_torque"
+            yield f"{readable_entry(limit.entry)} is {held}: it may keep to {share:.4g} N m, below drives.max_torque"
 
 
 def _count(family: Family, found: DriveEntries, drive: CanopenDrive) -> float | None:
@@ -476,14 +482,14 @@ def _count(family: Family, found: DriveEntries, drive: CanopenDrive) -> float | 
     unit = family.unit
     if unit is None or next(_unknown(unit, drive), None):
         return None
-    factor = torque_unit(unit, drive)
+    factor = torque_unit_size(unit, drive)
     if unit.rated is None:
         return factor * (unit.count or 0.0)
     held = found.get(parse_entry(unit.rated, ""))
     return None if not held else held * factor * 1e-3
 
 
-def torque_unit(unit: TorqueUnit, drive: CanopenDrive) -> float:
+def torque_unit_size(unit: TorqueUnit, drive: CanopenDrive) -> float:
     """Return the size of one unit of a torque [N m]; factors that the description lacks count as 1."""
     constant = drive.torque_constant or 1.0 if unit.of_current else 1.0
     return TORQUE_UNITS[unit.unit] * constant * (drive.current_unit or 1.0 if unit.unit == "own" else 1.0)
@@ -491,7 +497,7 @@ def torque_unit(unit: TorqueUnit, drive: CanopenDrive) -> float:
 
 def _unknown(unit: TorqueUnit, drive: CanopenDrive) -> Iterator[Problem]:
     """Tell what a description lacks to convert counts of a current to torques."""
-    of = "a count" if unit.rated is None else named(unit.rated)
+    of = "a count" if unit.rated is None else readable_entry(unit.rated)
     if unit.of_current and drive.torque_constant is None:
         yield Problem("drives.torque_constant", f"{of} is of a current: give it [N m/A]")
     if unit.unit == "own" and drive.current_unit is None:
@@ -504,7 +510,7 @@ def _unit_problems(family: Family, found: DriveEntries, count: float | None) -> 
         return
     if count is None and not found.get(parse_entry(unit.rated, "")):
         words = "is 0 or not there, so the value of a count is unknown: enter the motor data with the maker's tool"
-        yield Problem(named(unit.rated), words)
+        yield Problem(readable_entry(unit.rated), words)
 
 
 def _unit_changes(family: Family, found: DriveEntries, drive: CanopenDrive, count: float | None) -> Iterator[Problem]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from drivers.arm import Watchdog
 from drivers.canopen import object_dictionary as od
-from drivers.canopen.capabilities import DRIVE_PROFILE, TORQUE_UNITS, Capabilities, parse_entry, where
+from drivers.canopen.capabilities import DRIVE_PROFILE, TORQUE_UNITS, Capabilities, entry_text, parse_entry
 from drivers.canopen.cia402 import (
     COMMUNICATION_ERROR,
     DISABLE_VOLTAGE,
@@ -39,7 +39,7 @@ from drivers.canopen.sdo import (
     Objects,
     SdoRefused,
     WriteNotVerified,
-    optional,
+    none_if_missing,
 )
 from drivers.canopen.stored_zero import Zeros
 from drivers.motor_units import Coordinates
@@ -79,7 +79,7 @@ def configure_pdos(objects: Objects, pdos: Sequence[Pdo], unused: Sequence[Pdo],
         DriverError: it does not answer, or forgets something.
     """
     for pdo in unused:
-        optional(lambda one: _off(objects, one), pdo)
+        none_if_missing(lambda one: _off(objects, one), pdo)
     variants = {pdo: _variants(pdo, dummies) for pdo in pdos}
     waiting = [pdo for pdo in pdos if not any(_is_there(objects, one) for one in variants[pdo])]
     at_once = False
@@ -134,7 +134,7 @@ def _is_timed(objects: Objects, pdo: Pdo, write: Write) -> bool:
     """
     if write.entry.sub == od.RPDO_TYPE.sub and not pdo.sent and pdo.type == _AT_SYNC[0]:
         return objects.read(write.entry) in _AT_SYNC[:2]
-    return optional(objects.holds, write) is not False
+    return none_if_missing(objects.holds, write) is not False
 
 
 def _variants(pdo: Pdo, dummies: Sequence[int]) -> list[Pdo]:
@@ -166,7 +166,7 @@ def _off(objects: Objects, pdo: Pdo) -> None:
     if objects.read(pdo.off.entry) & _NOT_VALID:
         return
     try:
-        objects.set(pdo.off)
+        objects.write_verified(pdo.off)
     except SdoRefused as refused:
         if refused.code not in READ_ONLY:
             raise
@@ -181,7 +181,7 @@ def _map(objects: Objects, variants: Sequence[Pdo]) -> None:
             return
         try:
             for write in pdo.mapping:
-                objects.set(write)
+                objects.write_verified(write)
         except SdoRefused as refused:
             refusals.append(refused)
         else:
@@ -254,11 +254,11 @@ class DriveConfiguration:
 
         Where positions are streamed the drive alone can keep the joints' limits; else the host does, cycle by cycle.
         """
-        most = min(self.drive.max_torque, self.motor.torque) if self.positions else self.drive.max_torque
+        most = min(self.drive.max_torque, self.motor.torque) if self.streams_positions else self.drive.max_torque
         return torque_limit_counts(most, self.drive.rated_torque)
 
     @property
-    def positions(self) -> bool:
+    def streams_positions(self) -> bool:
         """Return whether positions are streamed."""
         return isinstance(self.can.torque, PositionPath)
 
@@ -282,7 +282,7 @@ class DriveConfiguration:
         They protect nothing: drives in torque mode give torque beyond the position limits.
         """
         todo = [Write(od.SYNC_PERIOD, self.period_us)]
-        return todo if self.positions else [*todo, *self.position_limits(), *self.interpolation()]
+        return todo if self.streams_positions else [*todo, *self.position_limits(), *self.interpolation()]
 
     def position_limits(self) -> list[Write]:
         """Return the downloads of the position limits; empty for a motor without any."""
@@ -304,7 +304,9 @@ class DriveConfiguration:
 
     def pdos(self) -> list[Pdo]:
         """Return the PDOs that the drive shall have; without a timer it reports its status at every n-th SYNC."""
-        target = parse_entry(self.torque.target, "target position" if self.positions else "target torque", "counts")
+        target = parse_entry(
+            self.torque.target, "target position" if self.streams_positions else "target torque", "counts"
+        )
         found = []
         for pdo in self.profile.pdos(self.drive.node):
             own = tuple(target if slot in _TARGETS else slot for slot in pdo.slots)
@@ -314,37 +316,37 @@ class DriveConfiguration:
         return found
 
 
-def motor_limits(config: ArmConfig, found: Coordinates) -> list[MotorLimits]:
+def motor_limits(config: ArmConfig, coordinates: Coordinates) -> list[MotorLimits]:
     """Return each motor's limits of position, speed, deceleration and torque, converted from the joints'.
 
     Args:
         config: configuration with a CANopen driver and a transmission.
-        found: coordinates of the arm with the zero that the drives have.
+        coordinates: coordinates of the arm with the zero that the drives have.
     """
     driver, gears, joints = config.driver, config.transmission, list(config.joints.values())
     assert isinstance(driver, CanopenDriver)  # noqa: S101 - refused in the beginning
     assert gears is not None  # noqa: S101 - likewise
     lowest, highest = np.array([joint.position or (-np.inf, np.inf) for joint in joints]).T
-    limits = count_limits(found, lowest - LIMIT_SLACK, highest + LIMIT_SLACK)
+    limits = count_limits(coordinates, lowest - LIMIT_SLACK, highest + LIMIT_SLACK)
     speeds = motor_speeds(gears, [joint.velocity for joint in joints])
     brakes = quick_stop_decelerations(driver, gears, [joint.acceleration for joint in joints])
     torques = motor_torques(driver, gears, [joint.torque for joint in joints])
     return [MotorLimits(*one) for one in zip(limits, speeds, brakes, torques, strict=True)]
 
 
-def watchdogs_of(driver: CanopenDriver, names: Sequence[str]) -> tuple[Watchdog, ...]:
-    """Return the watchdog of each drive; `names` are what people call the drives."""
-    found, of_torque = zip(names, driver.drives, strict=True), ("rpdo_timer", "vendor")
+def watchdogs_of(driver: CanopenDriver, drive_names: Sequence[str]) -> tuple[Watchdog, ...]:
+    """Return the watchdog of each drive; `drive_names` are what people call the drives."""
+    found, of_torque = zip(drive_names, driver.drives, strict=True), ("rpdo_timer", "vendor")
     seconds = driver.watchdog_seconds
     return tuple(Watchdog(name, one.watchdog, seconds(one), one.watchdog in of_torque) for name, one in found)
 
 
-def differences(found: Mapping[str, int], wanted: DriveIdentity) -> list[str]:
+def identity_differences(reported: Mapping[str, int], configured: DriveIdentity) -> list[str]:
     """Describe each value of an identity (1018h) that is missing or not the configured one; empty if all agree."""
     return [
-        f"{name} is {found[name]:08X}h instead of {value:08X}h" if name in found else f"{name} is not told"
-        for name, value in wanted.model_dump(exclude_none=True).items()
-        if found.get(name) != value
+        f"{name} is {reported[name]:08X}h instead of {value:08X}h" if name in reported else f"{name} is not told"
+        for name, value in configured.model_dump(exclude_none=True).items()
+        if reported.get(name) != value
     ]
 
 
@@ -357,7 +359,7 @@ def quick_stop_option(config: ArmConfig) -> int:
     return _STAYS if config.control.after_stop in ("hold", "lower") else _LETS_GO
 
 
-def identify(objects: Objects, wanted: DriveIdentity) -> str:
+def identify(objects: Objects, configured: DriveIdentity) -> str:
     """Read a drive's identity and return it in words; raises DriverError where it is not the wanted one.
 
     Returns:
@@ -376,7 +378,7 @@ def identify(objects: Objects, wanted: DriveIdentity) -> str:
         except SdoRefused as refused:  # all but the vendor are optional (CiA 301, 7.5.2.19)
             if refused.code not in DOES_NOT_EXIST:
                 raise
-    if others := differences(found, wanted):
+    if others := identity_differences(found, configured):
         raise AnotherDrive(f"node {objects.node}: is not the drive that the configuration names: {', '.join(others)}")
     try:
         firmware = objects.read_bytes(_FIRMWARE, 0, "software version").decode("ascii", "replace").strip("\0 ")
@@ -412,7 +414,7 @@ def configure(objects: Objects, setup: DriveConfiguration) -> OperationMode:
     """
     _encoder(objects, setup.drive)
     _timing(objects, setup)
-    unused = setup.profile.silenced(setup.drive.node)
+    unused = setup.profile.unused_pdos(setup.drive.node)
     at_once = configure_pdos(objects, setup.pdos(), unused, setup.can.dummies)
     _rated_torque(objects, setup)
     _largest_torque(objects, setup)
@@ -427,7 +429,7 @@ def configure(objects: Objects, setup: DriveConfiguration) -> OperationMode:
         (objects.write_if_present if write.entry in spare else objects.ensure)(write)
     for write in setup.watchdog():
         objects.ensure(write)
-    for write in setup.position_limits() + setup.interpolation() if setup.positions else ():
+    for write in setup.position_limits() + setup.interpolation() if setup.streams_positions else ():
         objects.write_if_present(write)  # here they count: a drive moves by them
     for write in setup.hints():
         with suppress(SdoRefused, WriteNotVerified):
@@ -440,7 +442,7 @@ def _timing(objects: Objects, setup: DriveConfiguration) -> None:
     for write in setup.profile.identifiers(setup.drive.node):
         objects.write_if_present(write)
     counter = Write(od.SYNC_OVERFLOW, 0)
-    if optional(objects.holds, counter) is False:
+    if none_if_missing(objects.holds, counter) is False:
         objects.write_if_present(Write(od.SYNC_PERIOD, 0))
         objects.ensure(counter)
     objects.write_if_present(Write(od.SYNC_WINDOW, 0))  # torques come just before the next SYNC
@@ -498,7 +500,9 @@ class LeftDrive:
     reacts: bool = False
 
 
-def disable_supervision(objects: Objects, zeros: Zeros | None, number: int, restarted: Callable[[], bool]) -> LeftDrive:
+def disable_supervision(
+    objects: Objects, zeros: Zeros | None, drive_index: int, restarted: Callable[[], bool]
+) -> LeftDrive:
     """End a drive's supervision of its host unless it has power; return its state, and whether it may still react.
 
     A zero that the drive has confirmed it confirms afterwards too, and nothing else: one that restarted in the session
@@ -507,7 +511,7 @@ def disable_supervision(objects: Objects, zeros: Zeros | None, number: int, rest
     Args:
         objects: of the drive.
         zeros: zeros of the arm, None where drives know their position.
-        number: of the drive.
+        drive_index: of the drive.
         restarted: whether it has sent a boot-up message in the session.
 
     Raises:
@@ -518,7 +522,7 @@ def disable_supervision(objects: Objects, zeros: Zeros | None, number: int, rest
     state = state_of(objects.read(od.STATUS_WORD))
     if state not in POWER_OFF:
         return LeftDrive(state)
-    counts = zeros.held(objects, number) if zeros is not None else None
+    counts = zeros.stored_counts(objects, drive_index) if zeros is not None else None
     kept: SdoRefused | None = None
     reacts = False
     for entry in (od.ABORT_CONNECTION, od.HEARTBEAT_CONSUMER, od.GUARD_TIME):  # or 8130h would follow every session
@@ -531,7 +535,7 @@ def disable_supervision(objects: Objects, zeros: Zeros | None, number: int, rest
             if not missing and not fixed:
                 kept = kept or refused
     if zeros is not None and counts is not None:
-        zeros.restore_mark(objects, number, counts, restarted)
+        zeros.restore_mark(objects, drive_index, counts, restarted)
     if kept is not None:
         raise kept
     return LeftDrive(state, reacts)
@@ -565,7 +569,8 @@ def _encoder(objects: Objects, drive: CanopenDrive) -> None:
     which each has four counts.
     """
     counts, turns, motor, shaft = (
-        optional(objects.read, entry) for entry in (od.ENCODER_COUNTS, od.ENCODER_TURNS, od.GEAR_MOTOR, od.GEAR_SHAFT)
+        none_if_missing(objects.read, entry)
+        for entry in (od.ENCODER_COUNTS, od.ENCODER_TURNS, od.GEAR_MOTOR, od.GEAR_SHAFT)
     )
     if not counts or not turns or motor != shaft:
         return
@@ -585,7 +590,7 @@ def _rated_torque(objects: Objects, setup: DriveConfiguration) -> None:
     entry, size = parse_entry(unit.rated, "rated torque"), TORQUE_UNITS[unit.unit]
     wanted = Write(entry, round(rated / size))
     if wanted.value < 1 or abs(wanted.value * size - rated) > _ROUNDING * rated:
-        words = f"rated_torque {rated:g} N m is not whole {unit.unit}, which is what {where(entry)} holds"
+        words = f"rated_torque {rated:g} N m is not whole {unit.unit}, which is what {entry_text(entry)} holds"
         raise DriverError(f"node {objects.node}: {words}")
     try:
         objects.ensure(wanted)

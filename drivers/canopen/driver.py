@@ -41,7 +41,7 @@ from drivers.can.frame_log import BusSession
 from drivers.canopen import object_dictionary as od
 from drivers.canopen.bus_load import budget
 from drivers.canopen.bus_monitor import MonitoringArm
-from drivers.canopen.capabilities import required
+from drivers.canopen.capabilities import require_capabilities
 from drivers.canopen.cia402 import (
     DISABLE_VOLTAGE,
     ENABLE,
@@ -123,28 +123,28 @@ class StopCommand:
             except Exception:  # noqa: BLE001 - whatever the link died of, the other drives must be told
                 self._untold.append(number)
 
-    def counts(self, zero: Sequence[int]) -> Sequence[int] | None:
-        """Return `zero`; None, for no torque frames, while a drive's link has not taken its stop.
+    def counts(self, zero_counts: Sequence[int]) -> Sequence[int] | None:
+        """Return `zero_counts`; None, for no torque frames, while a drive's link has not taken its stop.
 
         Drives that get zero torque, but not yet the stop, would let an arm fall that they or their brakes are to hold.
 
         Args:
-            zero: torque of every drive [per mille of rated torque].
+            zero_counts: torque of every drive [per mille of rated torque].
         """
-        return None if self._untold else zero
+        return None if self._untold else zero_counts
 
-    def wait_until_off(self, buses: Buses, zero: Sequence[int] | None, period_ns: int) -> None:
+    def wait_until_off(self, buses: Buses, zero_counts: Sequence[int] | None, period_ns: int) -> None:
         """Cycle until the drives report that they are off, for a second at most; a lost command is sent again.
 
         Args:
             buses: open.
-            zero: zero torque, as for `counts`; None where no torque frames are sent.
+            zero_counts: zero torque, as for `counts`; None where no torque frames are sent.
             period_ns: of a cycle [ns].
         """
         for cycle in range(1, max(_FAREWELL, round(_BRAKING * 1e9 / period_ns)) + 1):
             self.repeat(buses)
             with suppress(Exception):  # of one cycle: the next one may be possible
-                buses.cycle(None if zero is None else self.counts(zero))
+                buses.cycle(None if zero_counts is None else self.counts(zero_counts))
             on = any(drive.state in _ENDING for drive in buses.drives)
             if cycle >= _FAREWELL and not on and not self._untold:
                 break
@@ -186,15 +186,15 @@ class MeasuredTorque:
         self.torque: Vector | None = None
         self.difference: Vector | None = None
 
-    def cycle(self, counts: Sequence[int], drives: Sequence[Drive]) -> None:
+    def update(self, torque_counts: Sequence[int], drives: Sequence[Drive]) -> None:
         """Update measured torque and its difference from the torques sent and the reports received in a cycle.
 
         Args:
-            counts: sent with its SYNC [per mille of rated torque], by drive.
+            torque_counts: sent with its SYNC [per mille of rated torque], by drive.
             drives: drives at the end of the cycle.
         """
         if self._compares:
-            self._told[self._cycle % len(self._told)] = counts
+            self._told[self._cycle % len(self._told)] = torque_counts
         self._cycle += 1
         new = [drive.torques > known for drive, known in zip(drives, self._reports, strict=True)]
         if not any(new):
@@ -262,7 +262,7 @@ class Reports:
         """Forget which missing reports were told, so that those still missing are reported once more."""
         self._missed = MissedReports()
 
-    def new(self, codecs: Iterable[BusCodec], cycle: int, now_ns: int) -> list[AxisEvent]:
+    def new_events(self, codecs: Iterable[BusCodec], cycle: int, now_ns: int) -> list[AxisEvent]:
         """Return the joints' events since the last call and, in every n-th cycle, reports that have gone missing."""
         found: list[AxisEvent] = []
         look = cycle % self._look_every == 0
@@ -270,7 +270,7 @@ class Reports:
             if (events := codec.take_events()) or look:
                 joints = self._joints[codec.profile.number]
                 found += axis_events(events, codec, joints)
-                found += self._missed.new(codec, now_ns, joints) if look else []
+                found += self._missed.new_events(codec, now_ns, joints) if look else []
         return found
 
 
@@ -280,7 +280,7 @@ class MissedReports:
     def __init__(self) -> None:
         self._told: set[tuple[int, int, AxisEventCode]] = set()
 
-    def new(self, codec: BusCodec, now_ns: int, joint_of: Mapping[int, int]) -> list[AxisEvent]:
+    def new_events(self, codec: BusCodec, now_ns: int, joint_of: Mapping[int, int]) -> list[AxisEvent]:
         """Return an event for each drive of one bus whose heartbeat or status report has newly gone missing.
 
         Args:
@@ -374,7 +374,7 @@ class CanopenArm(Arm):
             return arm.set_home()
 
     def log_frames(self, path: Path) -> None:
-        """Have the next session log every frame to a new file; DriverError where its suffix names no format."""
+        """Have the next session log every frame to a new file; DriverError for its suffix, at `open` if it exists."""
         self._session.log_frames(path)
 
     def logged(self) -> str:
@@ -402,11 +402,11 @@ class CanopenArm(Arm):
                 buses.close()  # without the farewell of `close`, which another host's drives would obey
                 raise
             self._buses = buses
-            buses.call()
+            buses.wake_drives()
             self._stop_enabled_drives(buses)
             self._find_zero(buses)
             self._identities = tuple(self._configured(buses))
-            buses.begin()
+            buses.start_pdos()
             self._require_no_restart(buses)
         except BaseException:
             self.close()
@@ -525,7 +525,7 @@ class CanopenArm(Arm):
         # While enabled, an exchange without a target sends no frame of it: drives that supervise them must notice.
         idle = self._stop.counts(self._counts) if self._streaming and not self._enabled else None
         stamp_ns = buses.cycle(self._counts if sends else idle)
-        self._measured.cycle(self._counts, buses.drives)
+        self._measured.update(self._counts, buses.drives)
         sample = self._sample(buses, stamp_ns)
         self._cycle += 1
         return sample
@@ -662,7 +662,7 @@ class CanopenArm(Arm):
     def _find_zero(self, buses: Buses) -> None:
         """Find the zero that the drives confirm, before they are configured, which may make them forget it."""
         if self._zeros is not None:
-            held = [self._zeros.held(buses.objects(number), number) for number in range(len(buses.drives))]
+            held = [self._zeros.stored_counts(buses.objects(number), number) for number in range(len(buses.drives))]
             self._coordinates = self._coordinates.zeroed(self._zeros.home_counts(held), self._zeros.home)
 
     def _configured(self, buses: Buses) -> Iterator[str]:
@@ -672,7 +672,7 @@ class CanopenArm(Arm):
             objects = buses.objects(number)
             self._boots[number] = buses.drives[number].boots
             identity = identify(objects, drive.identity)
-            can = required(objects, self._driver, number)
+            can = require_capabilities(objects, self._driver, number)
             identity += f"; {can.summary}"  # a preflight ticket is for what was found of the drive
             own = self._driver.reactions, self._quick_stop, motors[number], can
             self._begun = number + 1
@@ -683,14 +683,14 @@ class CanopenArm(Arm):
             if self._zeros is not None:
                 counts = self._coordinates.zero[number]
                 if not self._zeros.restore_mark(objects, number, counts, buses.restarted(number)):
-                    raise PositionUnknown(self._zeros.lost([drive.node]))
+                    raise PositionUnknown(self._zeros.lost_text([drive.node]))
                 identity += f", home at {counts} counts"  # a preflight ticket is for this zero
             yield identity
 
     def _require_no_restart(self, buses: Buses) -> None:
         """Raise DriverError where a drive has restarted since it was configured (PositionUnknown: it had a zero)."""
         if self._zeros is not None and (lost := [drive.node for drive in buses.drives if drive.boots]):
-            raise PositionUnknown(self._zeros.lost(lost))
+            raise PositionUnknown(self._zeros.lost_text(lost))
         if restarted := self._restarted(buses):
             raise DriverError(f"{'; '.join(restarted)}: what it was configured with is lost; open the arm again")
 
@@ -737,7 +737,7 @@ class CanopenArm(Arm):
             buses.lost,
             self._statuses(drives),
             max(drive.status_age for drive in drives),
-            tuple(self._reports.new(buses.codecs, self._cycle, self.clock.now_ns())),
+            tuple(self._reports.new_events(buses.codecs, self._cycle, self.clock.now_ns())),
             measured_torque=self._measured.torque,
             torque_difference=self._measured.difference if self._enabled else None,
             stamp_doubt_ns=buses.stamp_doubt_ns,

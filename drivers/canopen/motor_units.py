@@ -31,13 +31,13 @@ def coordinates(driver: CanopenDriver, transmission: Transmission) -> Coordinate
     )
 
 
-def count_limits(found: Coordinates, lowest: Vector, highest: Vector) -> list[tuple[int, int] | None]:
+def count_limits(coordinates: Coordinates, lowest: Vector, highest: Vector) -> list[tuple[int, int] | None]:
     """Return each motor's lowest and highest counts (607Dh) for joint limits, None without; DriverError beyond 32 bits.
 
     Raises:
         DriverError: counts that 32 bits do not hold.
     """
-    limits = found.count_limits(lowest, highest)
+    limits = coordinates.count_limits(lowest, highest)
     for low, high in filter(None, limits):
         if not -_TURN // 2 <= low <= high < _TURN // 2:
             raise DriverError(

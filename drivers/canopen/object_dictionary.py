@@ -54,7 +54,7 @@ class Entry:
         """Return index and sub-index in one number, `index << 8 | sub`."""
         return self.index << 8 | self.sub
 
-    def at(self, sub: int) -> Entry:
+    def at_sub_index(self, sub: int) -> Entry:
         """Return the same entry at another sub-index."""
         return replace(self, sub=sub)
 
@@ -168,6 +168,6 @@ class OperationMode:
 CST = 10  # cyclic synchronous torque, in 6060h and 6061h
 
 
-def pdo_entry(entry: Entry, number: int, sub: int | None = None) -> Entry:
-    """Return an entry of PDO 1 as that of PDO `number` (from 1), at another sub-index if one is given."""
-    return replace(entry, index=entry.index + number - 1, sub=entry.sub if sub is None else sub)
+def pdo_entry(entry: Entry, pdo_number: int, sub: int | None = None) -> Entry:
+    """Return an entry of PDO 1 as that of PDO `pdo_number` (from 1), at another sub-index if one is given."""
+    return replace(entry, index=entry.index + pdo_number - 1, sub=entry.sub if sub is None else sub)

@@ -235,11 +235,11 @@ class BusCodec:
         self._ours = {NMT, SYNC, HEARTBEAT + profile.host, *(RPDO2 + node for node in profile.nodes)}
         self._ours |= {frame.cob_id for frame in profile.torque_frames}
 
-    def torque_frames(self, counts: Sequence[int]) -> list[Frame]:
+    def torque_frames(self, target_counts: Sequence[int]) -> list[Frame]:
         """Return the frames that carry a torque, or a position, to every drive of this bus.
 
         Args:
-            counts: torques of all drives of the arm [per mille of rated torque, or counts], in the arm's order.
+            target_counts: torques of all drives of the arm [per mille of rated torque, or counts], in the arm's order.
 
         Raises:
             DriverError: a value that its bits do not hold, or too few of them; nothing is to be sent then.
@@ -247,23 +247,25 @@ class BusCodec:
         try:
             frames = []
             for one in self._frames:
-                values = [counts[k] for k in one.drives]
+                values = [target_counts[k] for k in one.drives]
                 if one.shift:
                     values = [value << one.shift for value in values]
                 frames.append(Frame(one.cob_id, one.pack(*values)))
             return frames
         except (struct.error, IndexError, TypeError) as error:
-            raise DriverError(f"bus {self.profile.number}: targets {list(counts)} cannot be sent: {error}") from None
+            raise DriverError(
+                f"bus {self.profile.number}: targets {list(target_counts)} cannot be sent: {error}"
+            ) from None
 
-    def sync(self) -> Frame:
+    def sync_frame(self) -> Frame:
         """Return the SYNC frame, which starts a cycle: drives latch torques and sample positions."""
         return self._sync
 
-    def heartbeat(self, state: NmtState = NmtState.OPERATIONAL) -> Frame:
+    def heartbeat_frame(self, state: NmtState = NmtState.OPERATIONAL) -> Frame:
         """Return the host's own heartbeat, which keeps the drives' watchdogs quiet."""
         return Frame(HEARTBEAT + self.profile.host, bytes([state]))
 
-    def control_word(self, node: int, word: int, mode: int) -> Frame:
+    def control_frame(self, node: int, word: int, mode: int) -> Frame:
         """Return the frame with a control word (6040h) and a mode of operation (6060h) for one drive (RPDO2)."""
         return Frame(RPDO2 + node, _CONTROL.pack(word, mode))
 
@@ -271,23 +273,23 @@ class BusCodec:
         """Return the SDO download of a control word: a drive that has left `operational` takes no RPDO."""
         return Frame(SDO_REQUEST + node, _CONTROL_DOWNLOAD.pack(_DOWNLOAD_2, od.CONTROL_WORD.index, 0, word))
 
-    def nmt(self, command: NmtCommand, node: int = 0) -> Frame:
+    def nmt_frame(self, command: NmtCommand, node: int = 0) -> Frame:
         """Return the frame with an NMT command for one node, or for all (0)."""
         return Frame(NMT, bytes([command, node]))
 
-    def begin_cycle(self, now_ns: int = 0, *, asks: bool = True) -> None:
+    def begin_cycle(self, now_ns: int = 0, *, positions_requested: bool = True) -> None:
         """Begin a cycle after SYNC was sent: each drive may answer once, and its data is a cycle older.
 
         Args:
             now_ns: time of SYNC [ns of the link's clock], for frames without a stamp.
-            asks: whether SYNC has been sent in it at all.
+            positions_requested: whether SYNC, which requests positions, has been sent in it at all.
         """
         self._open, self._now_ns, self._missing = True, now_ns, len(self.drives)
         for drive in self.drives:
             drive.answered = False
             drive.age += 1
             drive.status_age += 1
-            drive.order.behind += asks
+            drive.order.behind += positions_requested
 
     def end_cycle(self) -> None:
         """End the cycle at its deadline: uncertain answers are decided on, and answers from now on are late."""
@@ -353,7 +355,7 @@ class BusCodec:
             drive.late += 1
             drive.order.take_late()
             self._tell(EventCode.LATE, drive.node, "its position came after its cycle")
-        elif (age := drive.order.take(frame.stamp_ns - self._now_ns if frame.stamp_ns else None)) is None:
+        elif (age := drive.order.take_answer(frame.stamp_ns - self._now_ns if frame.stamp_ns else None)) is None:
             drive.duplicates += 1
             self._tell(EventCode.DUPLICATE, drive.node, "a second position in one cycle")
         else:

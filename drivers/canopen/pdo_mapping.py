@@ -42,9 +42,9 @@ class Write:
     value: int
     ignored: int = 0
 
-    def same(self, held: int) -> bool:
+    def is_held_by(self, held_value: int) -> bool:
         """Return whether a value that an entry holds is this one, but for the ignored bits."""
-        return not (held ^ self.value) & ~self.ignored
+        return not (held_value ^ self.value) & ~self.ignored
 
     @property
     def data(self) -> bytes:
@@ -195,7 +195,7 @@ class BusProfile:
         return self.watchdogs[self.nodes.index(node)] if self.watchdogs else "rpdo_timer"
 
     @property
-    def guarded(self) -> tuple[int, ...]:
+    def guarded_nodes(self) -> tuple[int, ...]:
         """Return the nodes of the drives whose watchdog is node guarding."""
         return tuple(node for node in self.nodes if self.watchdog(node) == "node_guarding")
 
@@ -236,7 +236,7 @@ class BusProfile:
 
     def heartbeat(self, node: int) -> Write:
         """Return the download of a drive's heartbeat period, 0 for a guarded one, which can send none (CiA 301)."""
-        return Write(od.HEARTBEAT_PRODUCER, 0 if node in self.guarded else _whole(self.heartbeat_drives, 1e-3))
+        return Write(od.HEARTBEAT_PRODUCER, 0 if node in self.guarded_nodes else _whole(self.heartbeat_drives, 1e-3))
 
     @property
     def status_syncs(self) -> int:
@@ -250,12 +250,12 @@ class BusProfile:
         todo = [Write(od.HEARTBEAT_CONSUMER, wait)]
         if self.watchdog(node) in ("heartbeat", "node_guarding"):  # or its reaction could not be received
             todo.append(Write(od.ERROR_BEHAVIOUR, _STAYS_OPERATIONAL))
-        if node in self.guarded:
+        if node in self.guarded_nodes:
             period, factor = self.guarding
             todo += [Write(od.GUARD_TIME, _whole(period, 1e-3)), Write(od.LIFE_FACTOR, factor)]
         return todo
 
-    def silenced(self, node: int) -> list[Pdo]:
+    def unused_pdos(self, node: int) -> list[Pdo]:
         """Return the PDOs that this profile does not use, to be switched off, with their default COB-IDs."""
         return [
             Pdo(number, sent, (TPDO1 if sent else RPDO1) + (number - 1) * 0x100 + node, _ON_RECEPTION, ())

@@ -50,10 +50,10 @@ class WriteNotVerified(DriverError):
     """Report that an entry was set without an abort, but holds something else."""
 
 
-def optional(do: Callable[[Any], T], what: Any) -> T | None:
+def none_if_missing(read: Callable[[Any], T], argument: Any) -> T | None:
     """Return `do(what)`; None where it raises SdoRefused because the drive has no such entry."""
     try:
-        return do(what)
+        return read(argument)
     except SdoRefused as refused:
         if refused.code not in DOES_NOT_EXIST:
             raise
@@ -148,7 +148,7 @@ class Objects:
     def holds(self, write: Write) -> bool:
         """Return whether an entry holds a value already; one that can only be written does not. Raises as `read`."""
         try:
-            return write.same(self.read(write.entry))
+            return write.is_held_by(self.read(write.entry))
         except SdoRefused as refused:
             if refused.code not in WRITE_ONLY:
                 raise
@@ -156,19 +156,19 @@ class Objects:
 
     def ensure(self, write: Write) -> None:
         """Write an entry unless it holds the value, and read it back; SdoRefused or WriteNotVerified if that fails."""
-        if not optional(self.holds, write):  # setting a missing entry raises the error
-            self.set(write)
+        if not none_if_missing(self.holds, write):  # setting a missing entry raises the error
+            self.write_verified(write)
 
     def write_if_present(self, write: Write) -> None:
         """Write an entry where it holds another value, and read it back; do nothing where the drive has none."""
-        if optional(self.holds, write) is False:
-            self.set(write)
+        if none_if_missing(self.holds, write) is False:
+            self.write_verified(write)
 
-    def set(self, write: Write) -> None:
+    def write_verified(self, write: Write) -> None:
         """Set an entry and read it back; WriteNotVerified if it holds something else, SdoRefused if aborted."""
         self.write(write)
         held = self.read(write.entry)
-        if not write.same(held):
+        if not write.is_held_by(held):
             raise WriteNotVerified(f"node {self.node}: {write.entry} was set to {write.value} but holds {held}")
 
     def _request(self, what: str, ask: Callable[..., Any], *arguments: Any) -> Any:
@@ -277,31 +277,31 @@ class Answers:
 
 def poll(
     links: Sequence[Link],
-    places: Iterable[Place],
+    nodes: Iterable[Place],
     entry: Entry,
     deadline_ns: int,
-    others: Callable[[int, Frame], None] = lambda bus, frame: None,
+    on_other_frame: Callable[[int, Frame], None] = lambda bus, frame: None,
 ) -> Answers:
     """Ask nodes for one entry by SDO, in bursts until a deadline; return the values and aborts that came.
 
     Args:
         links: of the arm's buses.
-        places: nodes to ask; `BURST` of a bus at a time.
+        nodes: nodes to ask; `BURST` of a bus at a time.
         entry: entry to upload.
         deadline_ns: time when nodes that have not answered are given up [ns of the links' clock]; each burst has its
             share.
-        others: called with the frames that are no answers, and the number of their bus.
+        on_other_frame: called with the frames that are no answers, and the number of their bus.
 
     Raises:
         DriverError: a bus is gone.
     """
     found = Answers()
-    waiting = [sorted(place for place in set(places) if place[0] == bus) for bus in range(len(links))]
+    waiting = [sorted(place for place in set(nodes) if place[0] == bus) for bus in range(len(links))]
     groups = -(-max(map(len, waiting)) // BURST)
     start_ns = links[0].clock.now_ns()
     for group in range(groups):
-        bursts = [places[BURST * group : BURST * (group + 1)] for places in waiting]
-        _ask(links, bursts, entry, start_ns + (deadline_ns - start_ns) * (group + 1) // groups, found, others)
+        bursts = [nodes[BURST * group : BURST * (group + 1)] for nodes in waiting]
+        _ask(links, bursts, entry, start_ns + (deadline_ns - start_ns) * (group + 1) // groups, found, on_other_frame)
     return found
 
 

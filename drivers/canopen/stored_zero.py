@@ -57,11 +57,11 @@ class Zeros:
             for drive, ratio, row in zip(driver.drives, gears.ratios, gears.coupling_matrix, strict=True)
         ]
 
-    def mark(self, number: int, counts: int) -> int:
+    def mark(self, drive_index: int, counts: int) -> int:
         """Return the value of 1020h:02 that marks these counts of a drive as its counts at home."""
-        return zlib.crc32(repr((_WHOSE, self._about[number], counts)).encode()) or 1
+        return zlib.crc32(repr((_WHOSE, self._about[drive_index], counts)).encode()) or 1
 
-    def held(self, objects: Objects, number: int) -> int | None:
+    def stored_counts(self, objects: Objects, drive_index: int) -> int | None:
         """Return the signed counts at home that a drive stores with a mark that fits them; else None."""
         try:
             mark = objects.read(od.ZERO_MARK)
@@ -70,19 +70,19 @@ class Zeros:
             if refused.code not in DOES_NOT_EXIST:
                 raise
             return None
-        return counts if mark == self.mark(number, counts) and mark else None
+        return counts if mark == self.mark(drive_index, counts) and mark else None
 
-    def keep(self, objects: Objects, number: int, counts: int) -> None:
-        """Store these counts at home and their mark in a drive, and read them back; raises as `Objects.set`."""
-        objects.set(Write(od.ZERO_COUNTS, counts & 0xFFFF_FFFF))
-        objects.set(Write(od.ZERO_MARK, self.mark(number, counts)))
+    def store(self, objects: Objects, drive_index: int, counts: int) -> None:
+        """Store counts at home and their mark in a drive, and read them back; raises as `Objects.write_verified`."""
+        objects.write_verified(Write(od.ZERO_COUNTS, counts & 0xFFFF_FFFF))
+        objects.write_verified(Write(od.ZERO_MARK, self.mark(drive_index, counts)))
 
-    def restore_mark(self, objects: Objects, number: int, counts: int, restarted: Callable[[], bool]) -> bool:
+    def restore_mark(self, objects: Objects, drive_index: int, counts: int, restarted: Callable[[], bool]) -> bool:
         """Store a drive's counts at home again, or delete its mark if it has restarted; return True if stored.
 
         Args:
             objects: of the drive.
-            number: number of the drive.
+            drive_index: number of the drive.
             counts: counts at home.
             restarted: whether it has sent a boot-up message; asked before, and when its answers have been heard.
 
@@ -90,18 +90,18 @@ class Zeros:
             Whether the drive confirms them; otherwise its mark has been deleted.
 
         Raises:
-            DriverError: as `Objects.set`.
+            DriverError: as `Objects.write_verified`.
         """
         if not restarted():
-            self.keep(objects, number, counts)
+            self.store(objects, drive_index, counts)
             if not restarted():
                 return True
-        self.forget(objects)
+        self.delete_mark(objects)
         return False
 
-    def forget(self, objects: Objects) -> None:
-        """Delete the mark in a drive, so that it confirms nothing, and read it back; raises as `Objects.set`."""
-        objects.set(Write(od.ZERO_MARK, 0))
+    def delete_mark(self, objects: Objects) -> None:
+        """Set a drive's mark to 0, which confirms no zero, and read it back; raises as `Objects.write_verified`."""
+        objects.write_verified(Write(od.ZERO_MARK, 0))
 
     def require_volatile_storage(self, objects: Objects) -> None:
         """Raise DriverError where a drive has no object 1020h for a zero, or would keep it without power.
@@ -128,21 +128,21 @@ class Zeros:
                 f"node {objects.node}: stores parameters by itself (1010h): its zero would outlive its count"
             )
 
-    def home_counts(self, held: Sequence[int | None]) -> list[int]:
-        """Return `held`, the counts at home of all drives; raises PositionUnknown where one is None.
+    def home_counts(self, stored: Sequence[int | None]) -> list[int]:
+        """Return `stored`, the counts at home of all drives; raises PositionUnknown where one is None.
 
         Args:
-            held: counts that each drive confirms.
+            stored: counts that each drive confirms.
 
         Raises:
             PositionUnknown: some confirm nothing; the message names them and says what to do.
         """
-        lost = [about[1] for about, counts in zip(self._about, held, strict=True) if counts is None]
+        lost = [about[1] for about, counts in zip(self._about, stored, strict=True) if counts is None]
         if lost:
-            raise PositionUnknown(self.lost(lost))
-        return [counts for counts in held if counts is not None]
+            raise PositionUnknown(self.lost_text(lost))
+        return [counts for counts in stored if counts is not None]
 
-    def lost(self, nodes: Sequence[int]) -> str:
+    def lost_text(self, nodes: Sequence[int]) -> str:
         """Return the message that drives have lost their zero, and what to do about it."""
         return (
             f"drives {', '.join(map(str, sorted(nodes)))} do not know where the arm stands: their encoders count from "

@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
-from drivers.can.bus_load import worst
+from drivers.can.bus_load import most_bits
 from drivers.can.bus_state import EventCode
 from drivers.can.can_frame import Frame
 from drivers.can.can_link import Link
@@ -115,7 +115,7 @@ class Buses:
         self._guards: dict[int, GuardedNode] = {}
         for number, (codec, _) in self._at.items():
             period, node = codec.profile.guarding[0], drives[number].node
-            if node in codec.profile.guarded:
+            if node in codec.profile.guarded_nodes:
                 self._guards[number] = GuardedNode(node, round(1e9 * period * GUARD_EARLY))
         self._next_ns: int | None = None
 
@@ -130,43 +130,43 @@ class Buses:
         for number in range(len(self.drives)):
             self.command_drive(number, command)
 
-    def command_drive(self, number: int, command: NmtCommand) -> None:
+    def command_drive(self, drive_index: int, command: NmtCommand) -> None:
         """Send an NMT command to one drive."""
-        codec, link = self._at[number]
-        link.send(codec.nmt(command, self.drives[number].node))
+        codec, link = self._at[drive_index]
+        link.send(codec.nmt_frame(command, self.drives[drive_index].node))
 
-    def control(self, number: int, word: int) -> None:
+    def control(self, drive_index: int, word: int) -> None:
         """Send a control word to one drive; one that enables it has the bits that its mode needs."""
-        codec, link = self._at[number]
-        mode = self.modes[number]
+        codec, link = self._at[drive_index]
+        mode = self.modes[drive_index]
         word |= mode.enabling if word == ENABLE else 0
-        link.send(codec.control_word(self.drives[number].node, word, mode.sent))
+        link.send(codec.control_frame(self.drives[drive_index].node, word, mode.sent))
 
-    def control_stop(self, number: int, word: int, *, deaf: bool = False) -> None:
+    def control_stop(self, drive_index: int, word: int, *, deaf: bool = False) -> None:
         """Send a control word that stops a drive; by SDO too if it is `deaf`, or may have left `operational`.
 
         Args:
-            number: of the drive.
+            drive_index: of the drive.
             word: control word that stops the drive.
             deaf: whether it has not obeyed such a word before.
         """
-        self.control(number, word)
-        codec, link = self._at[number]
-        drive = self.drives[number]
+        self.control(drive_index, word)
+        codec, link = self._at[drive_index]
+        drive = self.drives[drive_index]
         gone = self.enabled and (drive.age >= _SILENT or drive.nmt not in (None, NmtState.OPERATIONAL))
         if deaf or gone:
             link.send(codec.control_download(drive.node, word))
 
-    def ask(self, number: int, entry: Entry) -> None:
+    def request_upload(self, drive_index: int, entry: Entry) -> None:
         """Send the upload of an entry of up to four bytes; the answer comes with a later cycle (`Drive.uploads`)."""
-        codec, link = self._at[number]
+        codec, link = self._at[drive_index]
         codec.asked.add(entry.key)
-        link.send(Frame(SDO_REQUEST + self.drives[number].node, upload_request(entry)))
+        link.send(Frame(SDO_REQUEST + self.drives[drive_index].node, upload_request(entry)))
 
-    def mode_shown(self, number: int) -> int | None:
-        """Return the mode of operation by a drive's last answer to `ask`; None before one."""
-        display = self.modes[number].display
-        data = self.drives[number].uploads.get(display.key)
+    def mode_shown(self, drive_index: int) -> int | None:
+        """Return the mode of operation by a drive's last answer to `request_upload`; None before one."""
+        display = self.modes[drive_index].display
+        data = self.drives[drive_index].uploads.get(display.key)
         return display.unpack(data) if data is not None and len(data) == display.kind.size else None
 
     def other_modes(self) -> dict[int, str]:
@@ -180,7 +180,7 @@ class Buses:
         if found and now_ns >= self._ask_again_ns:
             self._asked, self._ask_again_ns = self._asked + 1, now_ns + _ASK_EVERY_NS
             number = list(found)[self._asked % len(found)]
-            self.ask(number, self.modes[number].display)
+            self.request_upload(number, self.modes[number].display)
         return found
 
     def forget_modes(self) -> None:
@@ -188,37 +188,37 @@ class Buses:
         for drive, mode in zip(self.drives, self.modes, strict=True):
             drive.uploads.pop(mode.display.key, None)
 
-    def link(self, number: int) -> Link:
+    def link(self, drive_index: int) -> Link:
         """Return the link to the bus that a drive is on."""
-        return self._at[number][1]
+        return self._at[drive_index][1]
 
-    def hear(self, number: int, deadline_ns: int) -> None:
+    def receive_one(self, drive_index: int, deadline_ns: int) -> None:
         """Wait for one frame on the bus of a drive, and decode it; raises DriverError on a dead bus."""
-        codec, link = self._at[number]
+        codec, link = self._at[drive_index]
         if (frame := link.receive(deadline_ns)) is not None:
             codec.receive(frame)
 
-    def objects(self, number: int) -> Objects:
+    def objects(self, drive_index: int) -> Objects:
         """Return the object dictionary of one drive, usable as long as nothing streams."""
-        codec, link = self._at[number]
-        return Objects(link, self.drives[number].node, codec.receive)
+        codec, link = self._at[drive_index]
+        return Objects(link, self.drives[drive_index].node, codec.receive)
 
-    def objects_in_cycles(self, number: int, counts: Sequence[int] | None) -> Objects:
+    def objects_in_cycles(self, drive_index: int, target_counts: Sequence[int] | None) -> Objects:
         """Return one drive's object dictionary, whose requests run cycles of all drives while they wait.
 
         Args:
-            number: of the drive.
-            counts: sent in the cycles that go on, see `cycle`.
+            drive_index: of the drive.
+            target_counts: sent in the cycles that go on, see `cycle`.
         """
-        return Objects(_RepliesInCycles(self, number, counts), self.drives[number].node)
+        return Objects(_RepliesInCycles(self, drive_index, target_counts), self.drives[drive_index].node)
 
-    def profile(self, number: int) -> BusProfile:
+    def profile(self, drive_index: int) -> BusProfile:
         """Return the profile of the bus that a drive is on."""
-        return self._at[number][0].profile
+        return self._at[drive_index][0].profile
 
-    def restarted(self, number: int) -> Callable[[], bool]:
+    def restarted(self, drive_index: int) -> Callable[[], bool]:
         """Return a function that tells whether a drive has sent a boot-up message since the buses were opened."""
-        drive = self.drives[number]
+        drive = self.drives[drive_index]
         return lambda: drive.boots > 0
 
     def listen(self) -> None:
@@ -246,7 +246,7 @@ class Buses:
                 if frame.error:
                     codec.receive(frame)
 
-    def call(self) -> None:
+    def wake_drives(self) -> None:
         """Bring every drive to pre-operational, and wait until all answer by SDO; raises DriverError if some do not.
 
         A drive that was just switched on may still boot, one whose last host died may be operational. Communication is
@@ -277,7 +277,7 @@ class Buses:
                 f"no answer of drives {silent} within {AWAKE:g} s; check power, cable and bit rate (`ident bus scan`)"
             )
 
-    def begin(self) -> None:
+    def start_pdos(self) -> None:
         """Start PDOs once drives and host are configured, and wait until all drives answer every SYNC in time.
 
         At first every drive reports its state, which takes the bus longer than a cycle. Whether answers are of the SYNC
@@ -315,11 +315,11 @@ class Buses:
             codec.forget_events()
         self.lost = 0
 
-    def cycle(self, counts: Sequence[int] | None) -> int:
+    def cycle(self, target_counts: Sequence[int] | None) -> int:
         """Wait for the next cycle and exchange its frames; return when SYNC was sent [ns of the links' clock].
 
         Args:
-            counts: torque of every drive [per mille of rated torque]; None for SYNC alone.
+            target_counts: torque of every drive [per mille of rated torque]; None for SYNC alone.
 
         Raises:
             DriverError: a bus is gone, or torques that cannot be sent, of which none has been.
@@ -331,7 +331,7 @@ class Buses:
             begin_ns += -(-late_ns // self._period_ns) * self._period_ns
             self.clock.sleep_until_ns(begin_ns)
         self._next_ns = begin_ns + self._period_ns
-        torques = [[] if counts is None else codec.torque_frames(counts) for codec in self.codecs]
+        torques = [[] if target_counts is None else codec.torque_frames(target_counts) for codec in self.codecs]
         for (codec, link), frames in zip(self._pairs, torques, strict=True):
             for heard in link.drain():
                 codec.receive(heard)
@@ -340,12 +340,12 @@ class Buses:
         before_ns = self.clock.now_ns()
         if "sync_loss" not in self.withheld:
             for codec, link in self._pairs:
-                link.send(codec.sync())
+                link.send(codec.sync_frame())
         # Not before: a drive acts when it hears SYNC.
         stamp_ns = self.clock.now_ns()
         self.stamp_doubt_ns = stamp_ns - before_ns if stamp_ns - before_ns > _DOUBT * self._period_ns else 0
         for codec in self.codecs:
-            codec.begin_cycle(stamp_ns, asks="sync_loss" not in self.withheld)
+            codec.begin_cycle(stamp_ns, positions_requested="sync_loss" not in self.withheld)
         deadline = max(begin_ns + round(RECEIVE * self._period_ns), stamp_ns + self._least_ns)
         for codec, link in self._pairs:
             while not codec.complete:
@@ -370,7 +370,7 @@ class Buses:
         silent = [number for number, drive in enumerate(self.drives) if drive.age >= _SILENT and not drive.boots]
         if self.enabled and silent:
             self._asked += 1
-            self.ask(silent[self._asked % len(silent)], od.STATUS_WORD)
+            self.request_upload(silent[self._asked % len(silent)], od.STATUS_WORD)
 
     def keep_alive(self) -> None:
         """Send the host's heartbeat when due, and poll a guarded drive that is due, but not what is withheld."""
@@ -379,7 +379,7 @@ class Buses:
         if now_ns >= self._heartbeat_ns and "heartbeat" not in self.withheld:
             self._heartbeat_ns = now_ns + self._heartbeat_period_ns
             for codec, link in self._pairs:
-                link.send(codec.heartbeat(NmtState.OPERATIONAL))
+                link.send(codec.heartbeat_frame(NmtState.OPERATIONAL))
 
     def _send_node_guarding(self, now_ns: int) -> None:
         """Ask the guarded drive that has waited longest, where its time has come; in one cycle no more than one."""
@@ -411,7 +411,7 @@ class _RepliesInCycles:
             try:
                 self._buses.cycle(self._counts)
             except DriverError:  # of the other bus, maybe, which must not keep this one from it
-                self._buses.hear(self._number, deadline_ns)
+                self._buses.receive_one(self._number, deadline_ns)
         found, drive.reply = drive.reply, None
         return found
 
@@ -424,7 +424,7 @@ def _on_the_wire(profile: BusProfile) -> float:
         *(sum(slot.kind.size for slot in profile.position_slots) for _ in profile.nodes),
     ]
     bus = profile.bus
-    return sum(worst(length, fd=profile.fd).seconds(bus.bitrate, bus.data_bitrate) for length in lengths)
+    return sum(most_bits(length, fd=profile.fd).seconds(bus.bitrate, bus.data_bitrate) for length in lengths)
 
 
 MODE_PATIENCE = 5.0  # s that a mode of operation may take once drives are switched on (ros2_canopen waits as long)

@@ -67,10 +67,10 @@ class ZeroingArm(MonitoringArm):
     def _set(self, zeros: Zeros, counts: Sequence[int]) -> None:
         numbers = range(len(self._places))
         for number in numbers:
-            zeros.forget(self._objects(number))
+            zeros.delete_mark(self._objects(number))
         for number in numbers:
-            zeros.keep(self._objects(number), number, counts[number])
-        if [zeros.held(self._objects(number), number) for number in numbers] != list(counts):
+            zeros.store(self._objects(number), number, counts[number])
+        if [zeros.stored_counts(self._objects(number), number) for number in numbers] != list(counts):
             raise DriverError("a drive does not hold the zero that it was given")
         self._require_still(counts, self._counts())
         self._heard.drain(self._links)
@@ -82,7 +82,7 @@ class ZeroingArm(MonitoringArm):
         left = []
         for number, (_, node) in enumerate(self._places):
             try:
-                zeros.forget(self._objects(number))
+                zeros.delete_mark(self._objects(number))
             except Exception:  # noqa: BLE001 - one drive must not keep the others from it
                 left.append(str(node))
         return left

@@ -525,7 +525,9 @@ def _check(arguments: argparse.Namespace) -> Answer:
     # or SIGTERM ends it at once, a question too, with torque off; a program's signal waits for the next cycle.
     with (
         interrupting() if lease is None else stopping,
-        ControlFile.take(control_path(state, config.name), None, requested_ns=arguments.requested_ns) as controls,
+        ControlFile.take(
+            control_path(state, config.name), None, motion_requested_ns=arguments.requested_ns
+        ) as controls,
     ):
         stoppable = InterruptibleArm(arm, stop_or_lapsed(lambda: controls.stop or stopping.requested(), lease))
         positions = PositionFile(arm_folder(state, config.name), config)
@@ -538,10 +540,10 @@ def _check(arguments: argparse.Namespace) -> Answer:
                 model,
                 motion,
                 confirm=partial(typed_confirmation, arguments),
-                tell=lambda check: step(*_PREFLIGHT.get(check.code, ("checking", None))),
-                rate_seconds=seconds,
-                closed=closed,
-                announce=lambda action: tell(arguments, f"{config.name}: {action}"),
+                on_check=lambda check: step(*_PREFLIGHT.get(check.code, ("checking", None))),
+                holding_seconds=seconds,
+                last_position=closed,
+                tell_operator=lambda action: tell(arguments, f"{config.name}: {action}"),
             )
         if any(one.code == "at_rest" and one.verdict is Verdict.PASSED for one in ticket.checks):
             positions.keep(arm)
@@ -678,13 +680,13 @@ def _stopped(arguments: argparse.Namespace, state: Path) -> Answer:
 
 
 def _ask(arguments: argparse.Namespace) -> Answer:
-    from ident_service.motion.command_channel import in_use
+    from ident_service.motion.command_channel import is_control_file_in_use
     from ident_service.operations.moving_arms import ask_process
 
     os.umask(0o077)
     name, path = _control(arguments)
     if arguments.asks == "supported":
-        held = in_use(path)
+        held = is_control_file_in_use(path)
         _require_typed(
             arguments, name, "is lowered slowly" if held else "is released by its drives AT ONCE, if they hold it"
         )

@@ -520,8 +520,9 @@ def _text(arm: str | None, own: Held, findings: Sequence[Finding], woken: Woken,
         lines.append(f"  {words[one.state.value]:<8} {one.what}: {one.found}")
         lines += [f"{'':11}-> {one.remedy}"] if one.remedy else []
     lines += ["", f"woken every {1e3 * woken.period:g} ms for {woken.seconds:.0f} s, {woken.sentence}"]
-    late = f"late by {1e3 * float(woken.late.max()):.3g} ms at worst, {1e3 * woken.share(0.999):.3g} ms at 99.9 %"
-    lines.append(f"  {late}, {1e3 * woken.share(0.5):.3g} ms at the median")
+    worst, most = 1e3 * float(woken.late.max()), 1e3 * woken.lateness_quantile(0.999)
+    late = f"late by {worst:.3g} ms at worst, {most:.3g} ms at 99.9 %"
+    lines.append(f"  {late}, {1e3 * woken.lateness_quantile(0.5):.3g} ms at the median")
     host = "" if woken.stolen is None else f"; {woken.stolen:.1%} of the time went to others on this machine's host"
     lines += [f"  load {woken.load:.2f}; {woken.faults} pages had to be found{host}", ""]
     for each in held:
@@ -559,8 +560,8 @@ def _document(
             "period": woken.period,
             "granted": woken.sentence,
             "worst_late": float(woken.late.max()),
-            "p999_late": woken.share(0.999),
-            "median_late": woken.share(0.5),
+            "p999_late": woken.lateness_quantile(0.999),
+            "median_late": woken.lateness_quantile(0.5),
             "stolen_share": woken.stolen,
             "page_faults": woken.faults,
             "load": woken.load,
@@ -615,7 +616,7 @@ def _emulate(arguments: argparse.Namespace) -> Answer:
     tell(arguments, f"{config.name}: emulated drives; Ctrl-C ends{then}")
     stopping = StopOnSignal()
     # On another core than the motion process, if there is one.
-    with stopping, temporary_privileges(core_from_last=1, settings=Realtime(priority=config.realtime.priority)):
+    with stopping, temporary_privileges(core_counted_from_last=1, settings=Realtime(priority=config.realtime.priority)):
         done = emulate(
             config,
             faults=arguments.fault,

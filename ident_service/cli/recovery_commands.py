@@ -106,11 +106,11 @@ def _move_held_arm_home(arguments: argparse.Namespace, config: ArmConfig) -> Ans
     """Have the process that holds the arm after a stop move it home; return None where no process holds it."""
     from ident_service.cli.archive_commands import write_audit_entry
     from ident_service.cli.output import state_folder
-    from ident_service.motion.command_channel import LEASE_SECONDS, ControlFile, Homing, in_use
+    from ident_service.motion.command_channel import LEASE_SECONDS, ControlFile, Homing, is_control_file_in_use
     from ident_service.registry.state_folder import control_path
 
     path = control_path(state_folder(arguments), config.name)
-    if not in_use(path):
+    if not is_control_file_in_use(path):
         return None
     with ControlFile.reach(path) as controls:
         if not controls.waiting:
@@ -122,7 +122,7 @@ def _move_held_arm_home(arguments: argparse.Namespace, config: ArmConfig) -> Ans
         asked, pid, stopped = stop_or_lapsed(stopping.requested, lease), controls.pid, False
         controls.request_home()
         tell(arguments, f"{config.name}: keep out of its reach; process {pid} moves it home, slowly. Ctrl-C stops.")
-        while (stage := controls.homing) in (Homing.ASKED, Homing.GOING) and in_use(path):
+        while (stage := controls.homing) in (Homing.ASKED, Homing.GOING) and is_control_file_in_use(path):
             if not stopped and asked():
                 controls.request_stop()
                 stopped = True
@@ -134,7 +134,7 @@ def _move_held_arm_home(arguments: argparse.Namespace, config: ArmConfig) -> Ans
     if stage is Homing.ENDED and not stopped:
         return DONE, f"{config.name}: at home; held there until `{supported}`\n", document
     why = "see the events of its run" if stage is Homing.REFUSED else "it was stopped"
-    held = f"it is still held: support it, then `{supported}`" if in_use(path) else "it is not held"
+    held = f"it is still held: support it, then `{supported}`" if is_control_file_in_use(path) else "it is not held"
     return FAILED, f"{config.name}: not moved home, {why}; {held}\n", document
 
 

@@ -106,7 +106,7 @@ class Anchor:
         self._give = GIVE * limits.velocity
         self._place = position.copy()
 
-    def back(self, position: Vector) -> Vector:
+    def displacement_back(self, position: Vector) -> Vector:
         """Return anchor minus position [rad or m], at most 0.01 s of the velocity limit; beyond, the anchor follows."""
         pull = np.clip(self._place - position, -self._give, self._give)
         self._place = position + pull
@@ -137,7 +137,7 @@ class Lowering:
         self._seen: Vector | None = None
         self._still = STILL * RESTING * limits.velocity
 
-    def beyond(self, position: Vector) -> Vector:
+    def displacement_inside(self, position: Vector) -> Vector:
         """Return the displacement that brings each joint inside its position limits [rad or m], (joints,); 0 inside."""
         return np.clip(position, self._limits.lower, self._limits.upper) - position
 

@@ -308,13 +308,13 @@ def _afterwards() -> Iterator[Step]:
     yield "closing is safe, and reopening counts cycles anew", closes
 
 
-def contract_text(name: str, found: tuple[Promise, ...]) -> str:
+def contract_text(arm_name: str, promises: tuple[Promise, ...]) -> str:
     """Format the tested promises as text: a summary line, then each with its outcome, and the reason if not kept."""
-    broken = sum(one.outcome is Outcome.BROKEN for one in found)
-    skipped = sum(one.outcome is Outcome.NOT_TRIED for one in found)
+    broken = sum(one.outcome is Outcome.BROKEN for one in promises)
+    skipped = sum(one.outcome is Outcome.NOT_TRIED for one in promises)
     verdict = f"{broken} broken" if broken else f"all kept, {skipped} not tried" if skipped else "all kept"
-    lines = [f"{name}: {len(found)} promises of the Arm contract, {verdict}", ""]
-    for one in found:
+    lines = [f"{arm_name}: {len(promises)} promises of the Arm contract, {verdict}", ""]
+    for one in promises:
         lines.append(f"{one.outcome.value:<10} {one.words}")
         lines += [f"{'':<10}   {one.why}"] if one.why else []
     return "\n".join([*lines, ""])

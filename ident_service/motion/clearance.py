@@ -27,7 +27,7 @@ from ident_service.excitation.trajectory import MotionPath
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.capsule_distances import CapsuleModel
 from ident_service.model.collision import CollisionModel
-from ident_service.motion.stop_trajectory import stop
+from ident_service.motion.stop_trajectory import plan_stop
 from ident_service.motion.trajectory import Reference, Setpoint, run_to_end
 
 _BEGINS, _POINTS = 0.05, 8  # s between stops, points on each
@@ -117,7 +117,7 @@ def trajectory_stop_contact(
 ) -> Generator[None, None, str | None]:
     """Check sampled stops out of a trajectory by exact shapes, in slices; describe the first that touches, or None."""
     for time in np.arange(0.0, reference.duration, _BEGINS).tolist():
-        stopping = stop(reference.at(time), limits)
+        stopping = plan_stop(reference.at(time), limits)
         yield
         times = np.linspace(0.0, stopping.duration, _POINTS).tolist()
         for first in range(0, _POINTS, _AT_ONCE):
@@ -135,26 +135,26 @@ def _touches(what: str, time: float, pair: str | None, distance: float) -> str:
 
 
 def trajectory_clearance(
-    collision: CollisionModel, reference: Reference, limits: MotionLimits, least: float
+    collision: CollisionModel, reference: Reference, limits: MotionLimits, least_distance: float
 ) -> Clearance:
-    """Return the certified lower bound of a trajectory's distance to anything; proven if it is at least `least` [m]."""
+    """Return a certified lower bound of a trajectory's distance to anything; proven if at least `least_distance`."""
 
     def position(time: Vector) -> Vector:
         return np.array([reference.at(float(t)).position for t in time])
 
-    return certified_along(collision, position, limits.velocity, reference.duration, least)
+    return certified_along(collision, position, limits.velocity, reference.duration, least_distance)
 
 
-def motion_stop_clearance(path: MotionPath, limits: MotionLimits, model: ArmModel) -> Nearest:
+def motion_stop_clearance(motion: MotionPath, limits: MotionLimits, model: ArmModel) -> Nearest:
     """Return the smallest capsule distance in sampled stops out of a motion, its pair, and when the stop begins [s]."""
     capsules = CapsuleModel(model)
     nearest = Nearest(float("inf"), None, 0.0)
     if not capsules.pairs:
         return nearest
-    for begin, end in path.distinct:
+    for begin, end in motion.distinct:
         for time in np.arange(begin, end, _BEGINS):
-            position, velocity, acceleration, _ = path.at(float(time))
-            way = stop(Setpoint(position, velocity, acceleration), limits)
+            position, velocity, acceleration, _ = motion.at(float(time))
+            way = plan_stop(Setpoint(position, velocity, acceleration), limits)
             postures = np.array([way.at(share * way.duration).position for share in np.linspace(0.0, 1.0, _POINTS)])
             distances = capsules.distances(postures).min(axis=1)
             pair = int(distances.argmin())
@@ -163,20 +163,20 @@ def motion_stop_clearance(path: MotionPath, limits: MotionLimits, model: ArmMode
     return nearest
 
 
-def motion_stop_contact(path: MotionPath, limits: MotionLimits, model: ArmModel) -> str | None:
+def motion_stop_contact(motion: MotionPath, limits: MotionLimits, model: ArmModel) -> str | None:
     """Describe the sampled stop out of a motion in which capsules around bodies overlap most; None if none touch."""
-    nearest = motion_stop_clearance(path, limits, model)
+    nearest = motion_stop_clearance(motion, limits, model)
     if nearest.distance > 0.0:
         return None
     return _touches("motion", nearest.time, nearest.pair, nearest.distance)
 
 
-def require_clear(model: ArmModel, path: MotionPath, trajectories: Sequence[Reference], limits: MotionLimits) -> None:
+def require_clear(model: ArmModel, motion: MotionPath, trajectories: Sequence[Reference], limits: MotionLimits) -> None:
     """Raise MotionRefused unless motion and trajectories provably keep clear and no sampled stop out of them touches.
 
     Args:
         model: model of the arm, with its geometry and surroundings; without any, nothing is checked.
-        path: the motion.
+        motion: the motion.
         trajectories: trajectories to the motion and back from it.
         limits: of the arm.
 
@@ -187,9 +187,9 @@ def require_clear(model: ArmModel, path: MotionPath, trajectories: Sequence[Refe
     if not collision.pairs:
         return
     least = model.config.workspace.clearance
-    _require_proven("the motion", certified_clearance(collision, path, least), least)
+    _require_proven("the motion", certified_clearance(collision, motion, least), least)
     require_clear_trajectories(model, [("the path to or from the motion", one) for one in trajectories], limits)
-    if touching := motion_stop_contact(path, limits, model):
+    if touching := motion_stop_contact(motion, limits, model):
         raise MotionRefused(touching)
 
 
@@ -227,17 +227,17 @@ def _require_proven(what: str, clearance: Clearance, least: float) -> None:
 SAG = 0.25  # of the following error, that an arm may give way outwards when its torque begins, and lands inside at last
 
 
-def position_limit_violations(position: Vector, limits: MotionLimits, names: Sequence[str]) -> list[str]:
+def position_limit_violations(position: Vector, limits: MotionLimits, joint_names: Sequence[str]) -> list[str]:
     """Return a phrase for each joint that is outside its position limits, as NaN is; empty where none is.
 
     Args:
         position: [rad or m], shape (joints,).
         limits: of the arm.
-        names: of the joints.
+        joint_names: of the joints.
     """
     return [
         f"{name} at {q:.3f}, limits {low:g}..{high:g}"
-        for name, q, low, high in zip(names, position, limits.lower, limits.upper, strict=True)
+        for name, q, low, high in zip(joint_names, position, limits.lower, limits.upper, strict=True)
         if not low <= q <= high
     ]
 
@@ -248,32 +248,32 @@ def recoverable_limits(limits: MotionLimits) -> MotionLimits:
     return replace(limits, lower=limits.lower - more, upper=limits.upper + more)
 
 
-def require_near(position: Vector, limits: MotionLimits, names: Sequence[str]) -> None:
+def require_near(position: Vector, limits: MotionLimits, joint_names: Sequence[str]) -> None:
     """Raise MotionRefused where a joint stands farther outside its position limits than its following error.
 
     Raises:
         MotionRefused: naming every such joint.
     """
-    if position_limit_violations(position, recoverable_limits(limits), names):
+    if position_limit_violations(position, recoverable_limits(limits), joint_names):
         raise MotionRefused(
             "farther outside the position limits than a following error: "
-            f"{'; '.join(position_limit_violations(position, limits, names))}; its zero may be wrong: compare the "
-            "numbers with the arm, and bring it back by hand"
+            f"{'; '.join(position_limit_violations(position, limits, joint_names))}; its zero may be wrong: compare "
+            "the numbers with the arm, and bring it back by hand"
         )
 
 
-def relaxed_limits(position: Vector, limits: MotionLimits, share: float = SAG) -> MotionLimits:
-    """Return limits that contain `position`: widened, where it is outside, to `share` of following error beyond it.
+def relaxed_limits(position: Vector, limits: MotionLimits, following_error_share: float = SAG) -> MotionLimits:
+    """Return limits widened for joints that are outside: to `position` and a share of the following error beyond.
 
     Args:
         position: present position of the arm [rad or m], shape (joints,).
         limits: of the arm.
-        share: share of the following error that is added where a joint stands outside.
+        following_error_share: share of the following error that is added where a joint stands outside.
 
     Returns:
         The limits themselves in all joints that stand inside.
     """
-    more = share * limits.following_error
+    more = following_error_share * limits.following_error
     return replace(
         limits,
         lower=np.where(position < limits.lower, position - more, limits.lower),

@@ -145,30 +145,30 @@ class ControlFile:
     @classmethod
     def take(
         cls,
-        path: Path,
+        control_file: Path,
         lease_seconds: float | None,
         now_ns: Callable[[], int] = time.monotonic_ns,
-        requested_ns: int | None = None,
+        motion_requested_ns: int | None = None,
     ) -> Self:
         """Lock the control file for this process, clear its controls, start the lease; DriverError if it is in use.
 
-        Only a stop that was asked for after `requested_ns` is there from the beginning.
+        Only a stop that was asked for after `motion_requested_ns` is there from the beginning.
 
         Args:
-            path: path of the file, which is made where it is missing.
+            control_file: path of the file, which is made where it is missing.
             lease_seconds: how long the arm may move after `renew` [s]; None for a run that needs no lease.
             now_ns: the lease's clock.
-            requested_ns: time of the motion's request on that clock [ns]; when None, no earlier stop counts.
+            motion_requested_ns: time of the motion's request on that clock [ns]; when None, no earlier stop counts.
 
         Raises:
             DriverError: another process moves the arm.
             UsageError: the file cannot be made.
         """
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            control_file.parent.mkdir(parents=True, exist_ok=True)
+            fd = os.open(control_file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         except OSError as error:
-            raise UsageError(f"{path}: cannot be made: {error.strerror}; give another state folder") from None
+            raise UsageError(f"{control_file}: cannot be made: {error.strerror}; give another state folder") from None
         if not _locked(fd):
             pid = _pid_in(fd)
             os.close(fd)
@@ -184,12 +184,12 @@ class ControlFile:
         # Read last: a stop either finds these controls in place, or has left its time behind before.
         stopped = taken._words[_STOPPED // 8]
         # One that seems yet to come is from before the machine was started.
-        if requested_ns is not None and requested_ns <= stopped <= now_ns():
+        if motion_requested_ns is not None and motion_requested_ns <= stopped <= now_ns():
             taken.request_stop()
         return taken
 
     @classmethod
-    def reach(cls, path: Path, now_ns: Callable[[], int] = time.monotonic_ns) -> Self:
+    def reach(cls, control_file: Path, now_ns: Callable[[], int] = time.monotonic_ns) -> Self:
         """Open the control file of an arm that another process moves, which holds its lock; UsageError if none does.
 
         Raises:
@@ -197,25 +197,25 @@ class ControlFile:
             DriverError: the file cannot be opened, so that nobody can tell.
         """
         try:
-            fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+            fd = os.open(control_file, os.O_RDWR | os.O_CLOEXEC)
         except (FileNotFoundError, NotADirectoryError):
-            raise UsageError(f"the arm is not moving ({path} does not exist)") from None
+            raise UsageError(f"the arm is not moving ({control_file} does not exist)") from None
         except OSError as error:
-            raise _unreachable(path, error) from None
+            raise _unreachable(control_file, error) from None
         try:
             fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except OSError:
             if os.fstat(fd).st_size == _SIZE and os.pread(fd, 8, 0) == _MAGIC:
                 return cls(fd, mmap.mmap(fd, _SIZE), now_ns)
         os.close(fd)
-        raise UsageError(f"the arm is not moving ({path} is left from a run that has ended)")
+        raise UsageError(f"the arm is not moving ({control_file} is left from a run that has ended)")
 
     @classmethod
-    def stop_motions(cls, path: Path, now_ns: Callable[[], int] = time.monotonic_ns) -> int | None:
+    def stop_motions(cls, control_file: Path, now_ns: Callable[[], int] = time.monotonic_ns) -> int | None:
         """Request a stop of the motion under way and of all requested before now; return the moving pid or None.
 
         Args:
-            path: path of the file, which is made where it is missing.
+            control_file: path of the file, which is made where it is missing.
             now_ns: the clock of `take`.
 
         Raises:
@@ -224,8 +224,8 @@ class ControlFile:
         """
         refusal: OSError | None = None
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            control_file.parent.mkdir(parents=True, exist_ok=True)
+            fd = os.open(control_file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
             try:
                 os.pwrite(fd, struct.pack("<q", now_ns()), _STOPPED)
             finally:
@@ -233,12 +233,14 @@ class ControlFile:
         except OSError as error:
             refusal = error
         try:
-            with cls.reach(path, now_ns) as controls:
+            with cls.reach(control_file, now_ns) as controls:
                 controls.request_stop()
                 return controls.pid
         except UsageError:
             if refusal is not None:
-                raise UsageError(f"{path}: cannot be written: {refusal.strerror}; the arm is not moving now") from None
+                raise UsageError(
+                    f"{control_file}: cannot be written: {refusal.strerror}; the arm is not moving now"
+                ) from None
             return None
 
     @property
@@ -260,9 +262,9 @@ class ControlFile:
         """Return whether the arm is to pause."""
         return self._memory[_PAUSE] != 0
 
-    def request_pause(self, wanted: bool) -> None:
+    def request_pause(self, paused: bool) -> None:
         """Request that the arm pause (True) or go on (False), without waiting for it."""
-        self._memory[_PAUSE] = int(wanted)
+        self._memory[_PAUSE] = int(paused)
 
     @property
     def finish(self) -> bool:
@@ -359,19 +361,19 @@ class ControlFile:
         self.close()
 
 
-def controlling_pid(path: Path) -> int | None:
+def controlling_pid(control_file: Path) -> int | None:
     """Return the id of the process that moves the arm of a control file, None when no process does."""
     try:
-        with ControlFile.reach(path) as controls:
+        with ControlFile.reach(control_file) as controls:
             return controls.pid
     except UsageError:
         return None
 
 
-def stop_requested_ns(path: Path) -> int:
+def stop_requested_ns(control_file: Path) -> int:
     """Return when a stop of the arm was asked for last [ns of the machine's monotonic clock]; 0 where none is known."""
     try:
-        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        fd = os.open(control_file, os.O_RDONLY | os.O_CLOEXEC)
     except OSError:
         return 0
     try:
@@ -381,18 +383,18 @@ def stop_requested_ns(path: Path) -> int:
     return int(struct.unpack("<q", stamp)[0]) if len(stamp) == 8 else 0
 
 
-def in_use(path: Path) -> bool:
-    """Return whether a process holds the lock of a control file, as the one that moves the arm does.
+def is_control_file_in_use(control_file: Path) -> bool:
+    """Return whether a process holds the lock of a control file, as one moving the arm does; DriverError if unreadable.
 
     Raises:
         DriverError: the file cannot be opened, so that nobody can tell.
     """
     try:
-        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        fd = os.open(control_file, os.O_RDONLY | os.O_CLOEXEC)
     except (FileNotFoundError, NotADirectoryError):
         return False
     except OSError as error:
-        raise _unreachable(path, error) from None
+        raise _unreachable(control_file, error) from None
     try:
         fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except OSError:
@@ -476,7 +478,7 @@ class SupervisedCommands:
         self._controls.tell_homing(stage)
 
     @property
-    def cut(self) -> bool:
+    def requester_gone(self) -> bool:
         """Return whether the requester's end of the pipe is closed, as it is when the requester has died."""
         return bool(self._poll.poll(0))
 
@@ -487,7 +489,7 @@ class SupervisedCommands:
         """
         if self._controls.homing is Homing.GOING:
             return self._lock_step or self._controls.home_lease_is_valid()
-        return not self.cut and (self._lock_step or self._controls.lease_is_valid())
+        return not self.requester_gone and (self._lock_step or self._controls.lease_is_valid())
 
 
 class InterruptibleArm(Arm):

@@ -1,11 +1,12 @@
 """Run the control cycle: exchange, judge, follow, limit, record, react.
 
-exchange -> deadlines -> course -> guard.feedback -> control law -> guard.torque -> sink -> reaction -> controls
+exchange -> deadlines -> course -> guard.check_feedback -> control law -> guard.limit_torque -> sink -> reaction
+-> controls
 
 Arms whose drives close the position loop (`ArmDescription.streams_position`) are given the reference itself, through
-`guard.position`. The control law is computed all the same, and not sent: what it would add for the following error
-tells a joint that stands still although it is pushed. No torque can lower such an arm: where the table says damped
-lowering, its drives quick-stop.
+`guard.limit_position`. The control law is computed all the same, and not sent: what it would add for the following
+error tells a joint that stands still although it is pushed. No torque can lower such an arm: where the table says
+damped lowering, its drives quick-stop.
 
 Reactions that end torque are an `ArmFault` out of `Loop.run`; taking the torque away is `run.py`'s. After a stop the
 loop goes on until the arm has been measured at rest and held for a while, see `faults.py`; one without brakes until a
@@ -112,18 +113,18 @@ class Loop:
         self._rest_speed = REST_SPEED * self.limits.velocity
         self._hold_speed = HOLD_SPEED * self.limits.velocity
 
-    def run(self, target: Vector, first: Sample | None = None) -> None:
-        """Send `target`, then run cycles until DONE or a stopped arm is secured; ArmFault where torque must end now.
+    def run(self, first_command: Vector, first_sample: Sample | None = None) -> None:
+        """Send a torque or position, run cycles until DONE or a stopped arm is secured; ArmFault if torque must end.
 
         Args:
-            target: target of the first cycle, which holds the arm where it stands, shape (joints,): torque [N m or N],
-                or position [rad or m] of an arm that is given positions.
-            first: sample of the first cycle, where `target` has been exchanged already.
+            first_command: what the first cycle sends, which holds the arm where it stands, shape (joints,): torque
+                [N m or N], or position [rad or m] of an arm that is given positions.
+            first_sample: sample of the first cycle, where `first_command` was sent already; it is not sent again.
 
         Raises:
             ArmFault: torque must end now.
         """
-        wanted = self._after(self._exchanged(target) if first is None else first)
+        wanted = self._after(self._exchanged(first_command) if first_sample is None else first_sample)
         while wanted is not None:
             wanted = self._after(self._exchanged(wanted))
 
@@ -132,13 +133,13 @@ class Loop:
         try:
             return (self.arm.exchange_position if self.gives_positions else self.arm.exchange)(target)
         except DriverError as error:
-            raise self._end(self.guard.findings.found("driver", str(error))) from error
+            raise self._end(self.guard.findings.count_fault("driver", str(error))) from error
 
     def _after(self, sample: Sample) -> Vector | None:
         """Run one cycle from its sample on; returns the target of the next cycle, or None at the end."""
         woken_ns, stamp_ns = self.arm.clock.now_ns(), sample.stamp_ns
         self.last.append(sample)
-        found = self.deadlines.cycle(stamp_ns, woken_ns, sample.stamp_doubt_ns)
+        found = self.deadlines.judge_cycle(stamp_ns, woken_ns, sample.stamp_doubt_ns)
         if found is not None:
             if found.reaction is Reaction.CONTROLLED_STOP and not self.gives_positions:
                 self.course.skip_to(stamp_ns)  # under the last torque the arm has gone on, not to the last position
@@ -148,7 +149,7 @@ class Loop:
             return None
         free = not self.gives_positions and (self._lowering is not None or self.states.state is State.STOPPED)
         reference = rest(self.control.position) if free else reference  # no position is asked for
-        usable, fault = self.guard.feedback(
+        usable, fault = self.guard.check_feedback(
             sample,
             reference,
             self.control.velocity,
@@ -156,14 +157,14 @@ class Loop:
             self.control.feedback_acceleration,
             self.deadlines.elapsed,
             self.control.feedforward,
-            known=self.deadlines.known,
-            unexplained=sample.torque - self._explained if self._explained is not None else None,
+            elapsed_is_exact=self.deadlines.elapsed_is_exact,
+            unexplained_torque=sample.torque - self._explained if self._explained is not None else None,
         )
         law = self._law(sample, usable, reference, free)
         if self.gives_positions:
             self._explained = law - self.control.correction
         target, target_fault = (
-            self.guard.position(reference.position) if self.gives_positions else self.guard.torque(law)
+            self.guard.limit_position(reference.position) if self.gives_positions else self.guard.limit_torque(law)
         )
         compute_ns = self.arm.clock.now_ns() - woken_ns
         kept = sample if fault is None or fault.code != "feedback_not_finite" else self._finite(sample)
@@ -178,14 +179,16 @@ class Loop:
 
     def _law(self, sample: Sample, usable: Flags, reference: Setpoint, free: bool) -> Vector:
         """Return the torque that the control law asks for [N m or N], shape (joints,)."""
-        elapsed = self.deadlines.elapsed if self.deadlines.known else 0.0
+        elapsed = self.deadlines.elapsed if self.deadlines.elapsed_is_exact else 0.0
         if not free:
             return self.control.torque(sample.position, usable, reference, elapsed)
         needed, lowering = self._needed / REST_CYCLES, self._lowering
         if lowering is None:
-            back = self._anchor.back(self.control.position) if self._anchor is not None else 0.0
-            return self.control.damping(sample.position, usable, added=needed, elapsed=elapsed, back=back)
-        share, beyond = lowering.share, lowering.beyond(self.control.position)
+            back = self._anchor.displacement_back(self.control.position) if self._anchor is not None else 0.0
+            return self.control.damping(
+                sample.position, usable, added_torque=needed, elapsed_seconds=elapsed, displacement_back=back
+            )
+        share, beyond = lowering.share, lowering.displacement_inside(self.control.position)
         return self.control.damping(sample.position, usable, share, share * needed, elapsed, beyond)
 
     def _react(self, fault: Fault, stamp_ns: int) -> None:
@@ -305,7 +308,7 @@ class Loop:
             return bool(ask())
         except Exception as error:  # noqa: BLE001 - whatever they died of
             what = f"reading the controls failed ({error!r})"
-            self._react(self.guard.findings.found("controls_failed", what), stamp_ns)
+            self._react(self.guard.findings.count_fault("controls_failed", what), stamp_ns)
             return False
 
     def _is_lowered(self, lowering: Lowering, stamp_ns: int, since: float) -> bool:
@@ -336,7 +339,7 @@ class Loop:
             finish = self.controls.finish
         except Exception as error:  # noqa: BLE001 - whatever reading it died of, the arm must not fall for it
             self._react(
-                self.guard.findings.found("controls_failed", f"reading the controls failed ({error!r})"), stamp_ns
+                self.guard.findings.count_fault("controls_failed", f"reading the controls failed ({error!r})"), stamp_ns
             )
             return
         if stop:
@@ -352,7 +355,7 @@ class Loop:
             refusal = self.course.search_return()
             self._report_finish_refused(stamp_ns)
             if refusal is not None:
-                self._react(self.guard.findings.found("no_way_back", refusal), stamp_ns)
+                self._react(self.guard.findings.count_fault("no_way_back", refusal), stamp_ns)
             elif not pause:
                 self.course.go_on(stamp_ns)
 
@@ -365,7 +368,7 @@ class Loop:
     def _react_to_lost_lease(self, stamp_ns: int) -> None:
         """React to a lost lease; a stop that is under way already does not become a fault by it."""
         if self.states.state not in (State.STOPPING, State.STOPPED):
-            self._react(self.guard.findings.found("lease_lost", "the lease has ended"), stamp_ns)
+            self._react(self.guard.findings.count_fault("lease_lost", "the lease has ended"), stamp_ns)
 
     def _record(self, sample: Sample, reference: Setpoint, compute_ns: int) -> Fault | None:
         if self.states.state is State.STOPPED and self.after_stop is not StopSecuring.BRAKE:
@@ -397,7 +400,7 @@ class Loop:
             why = f"the recorder failed ({error})"
         if not why or self.states.state in (State.STOPPING, State.STOPPED):
             return None
-        return self.guard.findings.found("recorder_behind", why)
+        return self.guard.findings.count_fault("recorder_behind", why)
 
     def _finite(self, sample: Sample) -> Sample:
         """Return a sample for recordings: a position that is not finite is invalid and replaced by the one before."""
@@ -422,7 +425,9 @@ class Loop:
     def _named(self, code: str, what: str) -> Fault:
         """Return a fault of the joint that moves fastest relative to its limit; `{}` stands for its velocity."""
         joint = int(np.argmax(np.abs(self.control.velocity) / self.limits.velocity))
-        return self.guard.findings.found(code, self.guard.about(joint, what, self.control.velocity[joint]))
+        return self.guard.findings.count_fault(
+            code, self.guard.joint_message(joint, what, self.control.velocity[joint])
+        )
 
     def _end(self, fault: Fault) -> ArmFault:
         """Return the error that makes the caller take the torque away."""

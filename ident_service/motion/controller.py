@@ -68,20 +68,22 @@ class ComputedTorque:
         self._missing: tuple[Vector, Vector] | None = None
         self.correction = self.feedback_acceleration = self.feedforward = self._none
 
-    def torque(self, position: Vector, valid: Flags, reference: Setpoint, elapsed: float | None = None) -> Vector:
+    def torque(
+        self, position: Vector, valid: Flags, reference: Setpoint, elapsed_seconds: float | None = None
+    ) -> Vector:
         """Return the computed torque for the next cycle [N m or N], not yet limited; updates the velocity filter.
 
         Args:
             position: measured position [rad or m], shape (joints,).
             valid: mask of the fresh positions; elsewhere the joint is taken to have gone on as it went.
             reference: setpoint of the cycle.
-            elapsed: time since the update before [s]; one period when None; 0 where it is unknown, and the velocity
+            elapsed_seconds: time since the update before; one period when None; 0 where it is unknown, and the velocity
                 stays.
 
         Returns:
             Torque [N m or N], shape (joints,), not yet limited.
         """
-        position = self._filtered(position, valid, elapsed)
+        position = self._filtered(position, valid, elapsed_seconds)
         self.feedback_acceleration = self._kd * (reference.velocity - self.velocity) + self._kp * (
             reference.position - position
         )
@@ -96,30 +98,30 @@ class ComputedTorque:
         self,
         position: Vector,
         valid: Flags,
-        share: float = 1.0,
-        added: Vector | float = 0.0,
-        elapsed: float | None = None,
-        back: Vector | float = 0.0,
+        gravity_share: float = 1.0,
+        added_torque: Vector | float = 0.0,
+        elapsed_seconds: float | None = None,
+        displacement_back: Vector | float = 0.0,
     ) -> Vector:
-        """Update the velocity filter; return torque that damps motion, bears `share` of gravity and pulls by `back`.
+        """Update the velocity filter; return torque that damps motion, bears a share of gravity, and pulls back.
 
         Args:
             position: as for `torque`.
             valid: as for `torque`.
-            share: share of gravity to compensate.
-            added: tau_0, further torque that is needed to stand [N m or N], shape (joints,).
-            elapsed: as for `torque`.
-            back: e, displacement by which each joint is to be brought back [rad or m], shape (joints,).
+            gravity_share: share of gravity to compensate.
+            added_torque: tau_0, further torque that is needed to stand [N m or N], shape (joints,).
+            elapsed_seconds: as for `torque`.
+            displacement_back: e, displacement by which each joint is to be brought back [rad or m], shape (joints,).
 
         Returns:
             Torque [N m or N], shape (joints,), not yet limited.
         """
-        position = self._filtered(position, valid, elapsed)
+        position = self._filtered(position, valid, elapsed_seconds)
         self.correction = self.feedback_acceleration = self.feedforward = self._none
-        acceleration = self._kp * back - self._kd * self.velocity
-        torque = self._dynamics.torque(position, self.velocity, acceleration) + added
-        if share < 1.0:
-            torque = torque - (1.0 - share) * self._dynamics.torque(position, self._none, self._none)
+        acceleration = self._kp * displacement_back - self._kd * self.velocity
+        torque = self._dynamics.torque(position, self.velocity, acceleration) + added_torque
+        if gravity_share < 1.0:
+            torque = torque - (1.0 - gravity_share) * self._dynamics.torque(position, self._none, self._none)
         return torque
 
     def _filtered(self, position: Vector, valid: Flags, elapsed: float | None) -> Vector:

@@ -42,7 +42,7 @@ class Histogram:
             self.worst_ns = time_ns
         self._counts[bisect_left(self._edges, time_ns)] += 1
 
-    def below_us(self, share: float) -> float:
+    def quantile_us(self, share: float) -> float:
         """Return the bin edge [us] that `share` of all times do not exceed; the longest time if in the last bin."""
         if self.count == 0:
             return 0.0
@@ -58,9 +58,9 @@ class Histogram:
         return {
             "count": self.count,
             "worst_us": self.worst_ns / 1e3,
-            "median_below_us": self.below_us(0.5),
-            "p99_below_us": self.below_us(0.99),
-            "p999_below_us": self.below_us(0.999),
+            "median_below_us": self.quantile_us(0.5),
+            "p99_below_us": self.quantile_us(0.99),
+            "p999_below_us": self.quantile_us(0.999),
             "edges_us": list(_EDGES_US),
             "counts": list(self._counts),
         }
@@ -75,17 +75,17 @@ _MOST_UNKNOWN = 3  # cycles in a row without a velocity: two stalls, one after t
 LONGEST_GAP = 20  # periods without a cycle, in which the arm is not supervised (libfranka's lost packets)
 
 
-def longest_stall(described: float | None, period: float, watchdogs: Iterable[Watchdog]) -> float:
-    """Return the longest tolerated stall [s]: `described` or default, at most half of any watchdog and 19 periods.
+def longest_stall(configured_stall: float | None, period: float, watchdogs: Iterable[Watchdog]) -> float:
+    """Return the longest tolerated stall [s]: as configured or default, at most half of any watchdog and 19 periods.
 
     Args:
-        described: `control.longest_stall` of the arm's description [s].
+        configured_stall: `control.longest_stall` of the arm's description [s].
         period: of the loop [s].
         watchdogs: watchdogs of the drives. Half of the shortest time is the most: what comes late must not come too
             late. Nor is it more than nearly the gap that is called silence.
     """
     times = [one.seconds for one in watchdogs if one.seconds is not None]
-    asked = max(LONGEST_STALL, period) if described is None else described
+    asked = max(LONGEST_STALL, period) if configured_stall is None else configured_stall
     return min([asked, (LONGEST_GAP - 1) * period, *(0.5 * time for time in times)])
 
 
@@ -169,42 +169,42 @@ class Deadlines:
         self._expected_ns: int | None = None
 
     @property
-    def known(self) -> bool:
+    def elapsed_is_exact(self) -> bool:
         """Return whether `elapsed` is the true time between the last two samples, else the longest it may be."""
         return self._of.known
 
-    def cycle(self, stamp_ns: int, woken_ns: int, doubt_ns: int = 0) -> Fault | None:
+    def judge_cycle(self, stamp_ns: int, woken_ns: int, stamp_doubt_ns: int = 0) -> Fault | None:
         """Judge a cycle's timing; return its fault if it is late, after a silence or its stamp jumped, else None.
 
         Args:
             stamp_ns: of its sample [ns].
             woken_ns: the loop's clock after the exchange [ns].
-            doubt_ns: how much earlier than its stamp the sample may have been taken [ns].
+            stamp_doubt_ns: how much earlier than its stamp the sample may have been taken [ns].
         """
         period = self._period_ns
-        self.elapsed = self._of(stamp_ns, doubt_ns)
+        self.elapsed = self._of(stamp_ns, stamp_doubt_ns)
         came_ns = woken_ns if self._scheduled else stamp_ns
         off = 0 if self._expected_ns is None else came_ns - self._expected_ns
         self.lateness_ns = lateness = max(0, off)
         # Slots that were left out are not caught up with: the schedule goes on from the nearest one.
         beside = off - round(lateness / period) * period
         self._expected_ns = came_ns - beside + round(FOLLOWS * beside) + period
-        doubted_ns, self._doubt_ns = self._doubt_ns, doubt_ns
+        doubted_ns, self._doubt_ns = self._doubt_ns, stamp_doubt_ns
         before, self._stamp_ns = self._stamp_ns, stamp_ns
         woken_before, self._woken_ns = self._woken_ns, woken_ns
         if before is None:
             return None
         gap, slept = stamp_ns - before, woken_ns - woken_before
-        in_time = gap <= period + self._late_ns and lateness <= self._late_ns and not doubt_ns
+        in_time = gap <= period + self._late_ns and lateness <= self._late_ns and not stamp_doubt_ns
         if in_time and gap + doubted_ns > 0:
             return None
         if gap + doubted_ns <= 0:
-            return self._findings.found("clock_jump", f"consecutive stamps are {gap * 1e-6:g} ms apart")
+            return self._findings.count_fault("clock_jump", f"consecutive stamps are {gap * 1e-6:g} ms apart")
         if slept > LONGEST_GAP * period:
-            return self._findings.found("bus_silent", f"for {slept * 1e-6:g} ms there was no cycle")
+            return self._findings.count_fault("bus_silent", f"for {slept * 1e-6:g} ms there was no cycle")
         if gap > LONGEST_GAP * period:
-            return self._findings.found("clock_jump", f"consecutive stamps are {gap * 1e-6:g} ms apart")
-        return self._late(stamp_ns, max(gap - period, lateness, doubt_ns))
+            return self._findings.count_fault("clock_jump", f"consecutive stamps are {gap * 1e-6:g} ms apart")
+        return self._late(stamp_ns, max(gap - period, lateness, stamp_doubt_ns))
 
     def _late(self, stamp_ns: int, late_ns: int) -> Fault:
         """Count a late cycle and the cycles lost before it; too long a stall, or too many lost cycles, are a fault."""
@@ -214,12 +214,12 @@ class Deadlines:
         self._recently += lost
         while self._recent[0][0] <= stamp_ns - 1_000_000_000:
             self._recently -= self._recent.popleft()[1]
-        found = self._findings.found("late_cycle", f"a cycle came {late_ns * 1e-6:g} ms late")
+        found = self._findings.count_fault("late_cycle", f"a cycle came {late_ns * 1e-6:g} ms late")
         if late_ns > self._stall_ns:
             what = f"this computer stalled for {late_ns * 1e-6:.3g} ms, {self._stall_ns * 1e-6:g} ms are tolerated"
-            return self._findings.found("late_cycles", what)
+            return self._findings.count_fault("late_cycles", what)
         if self._recently > self._most_lost:
             within = f"{self._recently} of the {1e9 / self._period_ns:.0f} cycles of a second"
             what = f"this computer delayed or lost {within}, {self._most_lost:.0f} are tolerated"
-            return self._findings.found("late_cycles", what)
+            return self._findings.count_fault("late_cycles", what)
         return found

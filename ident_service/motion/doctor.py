@@ -32,7 +32,7 @@ from ident_service.motion.realtime import (
     IDLE_DRIVER,
     capable,
     core_numbers,
-    halts,
+    idle_cores_halt,
     temporary_privileges,
 )
 
@@ -95,7 +95,7 @@ class Woken:
         """Return the duration of the measurement [s]: the number of slots times their period."""
         return len(self.late) * self.period
 
-    def share(self, share: float) -> float:
+    def lateness_quantile(self, share: float) -> float:
         """Return the lateness that `share` of the slots do not exceed [s]."""
         return float(np.quantile(self.late, share))
 
@@ -183,17 +183,19 @@ def measuring_rate(rate: float) -> float:
     return rate * max(1, math.ceil(LEAST_RATE / rate))
 
 
-def judge_rates(woken: Woken, rate: float, described: float | None, watchdogs: tuple[Watchdog, ...] = ()) -> list[Held]:
+def judge_rates(
+    woken: Woken, rate: float, configured_stall: float | None, watchdogs: tuple[Watchdog, ...] = ()
+) -> list[Held]:
     """Judge `rate`, the measured rate and parts of it, highest first: good if no stall is too long and few are late.
 
     Args:
         woken: lateness that was measured.
         rate: rate that is judged in any case [Hz]; the measured one is a multiple of it.
-        described: `control.longest_stall` of the arm's description [s].
+        configured_stall: `control.longest_stall` of the arm's description [s].
         watchdogs: of its drives.
     """
     every = {*_SHARES, round(1.0 / (woken.period * rate))}
-    return [_held(woken, n, described, watchdogs) for n in sorted(every)]
+    return [_held(woken, n, configured_stall, watchdogs) for n in sorted(every)]
 
 
 def _held(woken: Woken, every: int, described: float | None, watchdogs: tuple[Watchdog, ...]) -> Held:
@@ -276,7 +278,7 @@ def _memory() -> Finding:
 
 def _wake_up(root: Path) -> Finding:
     what, file = "deep sleep of cores", root / "dev/cpu_dma_latency"
-    if halts(root / IDLE_DRIVER.relative_to("/")):
+    if idle_cores_halt(root / IDLE_DRIVER.relative_to("/")):
         return Finding(what, State.GOOD, "not this kernel's (virtual machine); a motion keeps its core from halting")
     if not file.exists():
         return Finding(what, State.UNKNOWN, "no /dev/cpu_dma_latency in this container, or kernel")

@@ -57,21 +57,21 @@ class EncoderCoordinates:
     torques: Vector
 
     @staticmethod
-    def of(coupling: Vector | None, joints: int) -> EncoderCoordinates:
+    def of(coupling: Vector | None, joint_count: int) -> EncoderCoordinates:
         """Create the coordinates of all joints and of the drives that move several joints, from the arm's coupling.
 
         Args:
             coupling: drive coordinates per joint coordinates, shape (joints, joints); each joint's own drive when None.
-            joints: number of joints.
+            joint_count: number of joints.
         """
         if coupling is None:
-            return EncoderCoordinates(np.zeros((0, joints)), np.zeros((0, joints)))
+            return EncoderCoordinates(np.zeros((0, joint_count)), np.zeros((0, joint_count)))
         shared = np.sum(coupling != 0.0, axis=1) > 1
         return EncoderCoordinates(coupling[shared], np.linalg.inv(coupling).T[shared])
 
-    def steps(self, position: Vector, before: Vector) -> Vector:
-        """Return the change of each joint and multi-joint drive since `before` [rad or m], shape (joints + drives,)."""
-        change = position - before
+    def steps(self, position: Vector, position_before: Vector) -> Vector:
+        """Return how far joints and multi-joint drives moved between two positions [rad or m], (joints + drives,)."""
+        change = position - position_before
         if not len(self.motions):
             return np.asarray(change)
         with np.errstate(invalid="ignore"):  # positions that are not finite are not valid either
@@ -84,22 +84,22 @@ class EncoderCoordinates:
             return valid
         return np.append(valid, (valid | (self.motions == 0.0)).all(axis=1))
 
-    def velocities(self, of_joints: Vector) -> Vector:
+    def velocities(self, joint_velocities: Vector) -> Vector:
         """Append the velocities (or accelerations) of drives that move several joints to those of joints."""
-        return np.append(of_joints, self.motions @ of_joints) if len(self.motions) else of_joints
+        return np.append(joint_velocities, self.motions @ joint_velocities) if len(self.motions) else joint_velocities
 
-    def forces(self, of_joints: Vector) -> Vector:
+    def forces(self, joint_torques: Vector) -> Vector:
         """Append the torques [N m or N] of drives that move several joints to those of the joints."""
-        return np.append(of_joints, self.torques @ of_joints) if len(self.torques) else of_joints
+        return np.append(joint_torques, self.torques @ joint_torques) if len(self.torques) else joint_torques
 
-    def largest_motions(self, of_joints: Vector) -> Vector:
+    def largest_motions(self, joint_motions: Vector) -> Vector:
         """Append each multi-joint drive's largest motion if every joint moves by at most its value."""
-        return np.append(of_joints, np.abs(self.motions) @ of_joints)
+        return np.append(joint_motions, np.abs(self.motions) @ joint_motions)
 
-    def largest_forces(self, of_joints: Vector) -> Vector:
+    def largest_forces(self, joint_torques: Vector) -> Vector:
         """Append each multi-joint drive's torque if only its most demanding joint needs its value."""
-        drives = np.abs(self.torques) * of_joints
-        return np.append(of_joints, drives.max(axis=1, initial=0.0))
+        drives = np.abs(self.torques) * joint_torques
+        return np.append(joint_torques, drives.max(axis=1, initial=0.0))
 
     def inertias(self, mass_matrix: Vector) -> Vector:
         """Return the inertia of each joint and multi-joint drive while all others stand [kg m^2 or kg]."""
@@ -158,31 +158,38 @@ class FrozenEncoderObserver:
     def update(
         self,
         steps: Vector,
-        correction: Vector,
+        feedback_torque: Vector,
         feedback_acceleration: Vector,
         position: Vector,
-        feedforward: Vector | float = 0.0,
+        friction_feedforward: Vector | float = 0.0,
     ) -> Flags:
         """Estimate unseen motion; return which joints and multi-joint drives exceed what their encoders can hide.
 
         Args:
             steps: change of each position since the cycle before [rad or m], 0 where it was not measured, shape
                 (joints + drives,).
-            correction: feedback torque [N m or N], shape (joints,); all zero where no position is asked for, which
+            feedback_torque: feedback torque [N m or N], shape (joints,); all zero where no position is asked for, which
                 allows no conclusion.
             feedback_acceleration: of the control law [rad/s^2 or m/s^2], shape (joints,).
             position: last known position [rad or m], shape (joints,).
-            feedforward: friction in the torque [N m or N], shape (joints,).
+            friction_feedforward: friction in the torque [N m or N], shape (joints,).
 
         Returns:
             Which joints and drives should have moved farther than their encoders can hide, shape (joints + drives,).
         """
         self._cycle += 1
-        encoders, given = self._encoders, correction
-        fed = feedforward if isinstance(feedforward, np.ndarray) else np.full(correction.shape, feedforward)
+        encoders, given = self._encoders, feedback_torque
+        fed = (
+            friction_feedforward
+            if isinstance(friction_feedforward, np.ndarray)
+            else np.full(feedback_torque.shape, friction_feedforward)
+        )
         fed = encoders.forces(fed)
-        correction, feedback_acceleration = encoders.forces(correction), encoders.velocities(feedback_acceleration)
-        pushed = correction + fed
+        feedback_torque, feedback_acceleration = (
+            encoders.forces(feedback_torque),
+            encoders.velocities(feedback_acceleration),
+        )
+        pushed = feedback_torque + fed
         self._note_changes(steps, pushed, feedback_acceleration, fed)
         shifts = [push - base for push, base in zip(pushed.tolist(), self._base, strict=True)]
         limits = zip(shifts, self._slid, self._sliding, self._standing, strict=True)
@@ -192,7 +199,7 @@ class FrozenEncoderObserver:
             self._reset_estimate()
             return self._none
         if not given.any():
-            self._base, self._base_acceleration = correction.tolist(), feedback_acceleration.tolist()
+            self._base, self._base_acceleration = feedback_torque.tolist(), feedback_acceleration.tolist()
             self._base_fed = [0.0] * len(self._base)
             self._reset_estimate()
             return self._none
@@ -227,7 +234,7 @@ class FrozenEncoderObserver:
 
 
 def frozen_encoder_observer(
-    dynamics: InverseDynamics, model: ArmModel, limits: MotionLimits, period: float, resolution: Vector
+    dynamics: InverseDynamics, model: ArmModel, limits: MotionLimits, period: float, position_resolution: Vector
 ) -> FrozenEncoderObserver:
     """Create the frozen-encoder observer of an arm; dry friction is the prior's, at least the configuration's guess."""
     guess, chain = model.config.design.friction_guess, model.chain
@@ -236,7 +243,7 @@ def frozen_encoder_observer(
     # The friction of joints that slide while a drive of theirs stands balances there: the sum would be too much.
     friction = EncoderCoordinates.of(coupling, chain.joints).largest_forces(joints)
     least = None if model.prior is None else InverseDynamics(chain, model.layout, model.prior)
-    return FrozenEncoderObserver(dynamics, limits, period, friction, resolution, least, coupling)
+    return FrozenEncoderObserver(dynamics, limits, period, friction, position_resolution, least, coupling)
 
 
 def encoder_coupling(config: ArmConfig) -> Vector | None:

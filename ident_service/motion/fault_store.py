@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from ident_service.errors import MotionRefused, UsageError
-from ident_service.motion.command_channel import in_use
+from ident_service.motion.command_channel import is_control_file_in_use
 from ident_service.recordings.files import write_atomically
 
 CONTROLS: Final = "control"  # the arm's control file, in its folder
@@ -102,13 +102,13 @@ class FaultStore:
         Raises:
             UsageError: a file is damaged.
         """
-        return self._read_stored(moving=in_use(self._controls))
+        return self._read_stored(moving=is_control_file_in_use(self._controls))
 
-    def began(self, run: Path) -> None:
+    def began(self, run_folder: Path) -> None:
         """Write a mark that this process is about to move the arm; MotionRefused while a fault is unacknowledged.
 
         Args:
-            run: folder of the run.
+            run_folder: folder of the run.
 
         Raises:
             MotionRefused: there is an unacknowledged fault.
@@ -116,7 +116,7 @@ class FaultStore:
         """
         self.require_none({one.code: one.cause for one in self._read_stored(moving=False)})
         self._mark.parent.mkdir(parents=True, exist_ok=True)
-        mark = {"pid": os.getpid(), "run": str(run), "began": time.time()}
+        mark = {"pid": os.getpid(), "run": str(run_folder), "began": time.time()}
         write_atomically(self._mark, json.dumps(mark) + "\n" + " " * _ROOM)
 
     def ended(self) -> None:
@@ -178,7 +178,7 @@ class FaultStore:
         if code not in faults:
             known = ", ".join(faults) or "none"
             raise UsageError(f"{self._arm}: no active fault {code!r} (active: {known})")
-        if in_use(self._controls):
+        if is_control_file_in_use(self._controls):
             raise UsageError(
                 f"{self._arm}: a process still controls the arm; stop and support it (`ident stop`, `ident "
                 "supported`), then acknowledge"

@@ -200,12 +200,12 @@ class FaultCounter:
         self.warnings: dict[str, int] = {}
         self._recent: dict[str, deque[int]] = {}
 
-    def found(self, code: str, what: str) -> Fault:
+    def count_fault(self, code: str, finding: str) -> Fault:
         """Create the fault of a code; a warning found in too many recent cycles gives the graver fault it becomes.
 
         Args:
             code: name of the fault in the table.
-            what: beginning of the sentence: which joint, what was measured, what is allowed.
+            finding: beginning of the sentence: which joint, what was measured, what is allowed.
         """
         rule = FAULTS[code]
         if rule.reaction is Reaction.WARN:
@@ -214,9 +214,9 @@ class FaultCounter:
             if not recent or recent[-1] != self.cycle:  # seven drives that are late once are late in one cycle
                 recent.append(self.cycle)
             if len(recent) > rule.often and recent[0] > self.cycle - WINDOW:
-                what = f"{code} in more than {rule.often} of the last {WINDOW} cycles ({what})"
+                finding = f"{code} in more than {rule.often} of the last {WINDOW} cycles ({finding})"
                 code, rule = rule.becomes, FAULTS[rule.becomes]
-        return Fault(code, rule.reaction, f"{what}: {rule.means}")
+        return Fault(code, rule.reaction, f"{finding}: {rule.means}")
 
 
 @dataclass(frozen=True)

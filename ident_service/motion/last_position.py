@@ -3,7 +3,7 @@
 An absolute encoder on the motor's side knows its angle within a turn. How many turns there were it counts, or keeps
 with a battery. Where that fails, every joint limit and every gravity torque is off by as much, and nothing that moves a
 little shows it: loops close, directions are right. So what the drives tell when the arm is opened is compared with what
-they told last (`turned`). Positions are looked at without a command and after the arm has been closed.
+they told last (`whole_turns_text`). Positions are looked at without a command and after the arm has been closed.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class PositionFile:
             DriverError: the arm does not answer.
         """
         last = self.read()
-        if last is not None and (words := turned(last, arm.exchange(None).position, self._config)):
+        if last is not None and (words := whole_turns_text(last, arm.exchange(None).position, self._config)):
             raise MotionRefused(f"{words}; {LOOK_AT_IT}")
 
     def read(self) -> LastPosition | None:
@@ -114,21 +114,21 @@ def is_new_every_time(arm: Arm, config: ArmConfig) -> bool:
     return arm.clock.lock_step or config.driver is None or config.driver.kind == "simulated"
 
 
-def turned(last: LastPosition, position: Vector, config: ArmConfig) -> str:
+def whole_turns_text(stored: LastPosition, position: Vector, config: ArmConfig) -> str:
     """Describe motors that made whole turns while an arm was closed; empty if none, one by a fraction, or no gears.
 
     Somebody may have moved the arm by hand. That all motors have turned by whole turns, and one by more than none, is
     what lost turns look like, and hardly what a hand does.
 
     Args:
-        last: position of the arm when it was closed.
+        stored: position of the arm when it was closed.
         position: present position, as the drives report it [rad or m], shape (joints,).
         config: of the arm.
     """
     gears = config.transmission
     if gears is None:
         return ""
-    turns = np.array(gears.ratios) * (gears.coupling_matrix @ (position - last.position)) / (2.0 * np.pi)
+    turns = np.array(gears.ratios) * (gears.coupling_matrix @ (position - stored.position)) / (2.0 * np.pi)
     whole = np.rint(turns)
     if not whole.any() or (np.abs(turns - whole) > TURN).any():
         return ""
@@ -137,9 +137,9 @@ def turned(last: LastPosition, position: Vector, config: ArmConfig) -> str:
         for number, count in enumerate(whole)
         if count
     ]
-    moved = zip(config.joints, position - last.position, strict=True)
+    moved = zip(config.joints, position - stored.position, strict=True)
     joints = ", ".join(f"{name} {away:+.4g}" for name, away in moved if abs(away) > 1e-3)
-    return f"{', '.join(motors)} when the arm was closed at {last.when:%Y-%m-%d %H:%M} UTC ({joints} rad or m)"
+    return f"{', '.join(motors)} when the arm was closed at {stored.when:%Y-%m-%d %H:%M} UTC ({joints} rad or m)"
 
 
 def _scale(config: ArmConfig) -> str:

@@ -85,10 +85,10 @@ class TimedSink:
         return self._sink.event(stamp_ns, level, message)
 
 
-def send_line(line: dict[str, Any]) -> None:
+def send_line(document: dict[str, Any]) -> None:
     """Write one line of JSON to standard output; it is lost where the pipe is closed, or full and non-blocking."""
     with suppress(OSError):
-        os.write(sys.stdout.fileno(), json.dumps(line).encode() + b"\n")
+        os.write(sys.stdout.fileno(), json.dumps(document).encode() + b"\n")
 
 
 def main() -> int:
@@ -115,7 +115,7 @@ def _ended(request: dict[str, Any]) -> tuple[int, dict[str, Any]]:
     """Run the motion with the control file taken; returns the exit code, and the last line for the parent."""
     try:
         place = Path(request["arm_folder"]) / CONTROLS
-        with ControlFile.take(place, request["lease"], requested_ns=request["requested_ns"]) as controls:
+        with ControlFile.take(place, request["lease"], motion_requested_ns=request["requested_ns"]) as controls:
             signal.signal(signal.SIGTERM, lambda *_: controls.request_stop())
             send_line({"pid": os.getpid()})
             return 0, {"report": _run_with_fault_store(request, controls)}
@@ -182,12 +182,12 @@ def _moved(request: dict[str, Any], controls: ControlFile, latch: ActiveFaults) 
             ticket.require_valid_for(subject_of(model, motion, arm.describe()), datetime.now(UTC))
             if not sink.event(arm.clock.now_ns(), 20, sentence):
                 raise MotionRefused(f"nothing would be recorded: {sink.error or 'the recorder cannot keep up'}")
-            if lifeline.cut:
+            if lifeline.requester_gone:
                 raise MotionRefused("the program that started the motion has ended")
             positions.require_no_lost_turns(arm)
             positions.forget()
             moves = True
-            report = follow(arm, model, plan, sink, lifeline, latch=latch)
+            report = follow(arm, model, plan, sink, lifeline, active_faults=latch)
     finally:
         if moves:
             positions.keep(arm)

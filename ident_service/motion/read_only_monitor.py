@@ -99,7 +99,7 @@ class _Sums:
 def watch(
     arm: Arm,
     seconds: float = 5.0,
-    tell: Callable[[ArmDescription, Sample], None] = lambda described, sample: None,
+    on_sample: Callable[[ArmDescription, Sample], None] = lambda described, sample: None,
     *,
     cycles: int | None = None,
     stop_requested: Callable[[], bool] = lambda: False,
@@ -109,7 +109,7 @@ def watch(
     Args:
         arm: the arm, not open.
         seconds: duration of watching [s].
-        tell: called with the arm's description and every sample.
+        on_sample: called with the arm's description and every sample.
         cycles: number of cycles to watch, instead of `seconds`.
         stop_requested: called every cycle; True ends watching with what has been seen.
 
@@ -127,11 +127,11 @@ def watch(
         wanted = max(1, round(seconds * described.rate)) if cycles is None else cycles
         sample = arm.exchange(None)
         sums.add(sample)
-        tell(described, sample)
+        on_sample(described, sample)
         while sums.cycles < wanted and not stop_requested():
             sample = arm.exchange(None)
             sums.add(sample)
-            tell(described, sample)
+            on_sample(described, sample)
     finally:
         arm.close()
     return _summary(described, sums, sample)

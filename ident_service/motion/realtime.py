@@ -87,11 +87,11 @@ class RealtimePrivileges:
         return f"real time: got {', '.join(got) or 'nothing'}" + "".join(f"; {reason}" for reason in self.refusals)
 
 
-def request_privileges(core_from_last: int = 0, settings: Realtime | None = None) -> RealtimePrivileges:
+def request_privileges(core_counted_from_last: int = 0, settings: Realtime | None = None) -> RealtimePrivileges:
     """Request real-time priority, locked memory and a core, stop garbage collection; return what was granted.
 
     Args:
-        core_from_last: number of the core, counted back from the last; for a second loop beside the first.
+        core_counted_from_last: number of the core, counted back from the last; for a second loop beside the first.
         settings: real-time settings of the arm's description, whose cores take precedence; defaults when None.
 
     Returns:
@@ -109,7 +109,7 @@ def request_privileges(core_from_last: int = 0, settings: Realtime | None = None
     # Memory that is taken before it is locked is locked with the rest.
     prefaulted = _prefault(refusals)
     memory = _lock_memory(refusals)
-    core = _own_core(_candidates(settings, core_from_last), bool(settings.cores), held, refusals)
+    core = _own_core(_candidates(settings, core_counted_from_last), bool(settings.cores), held, refusals)
     awake = _keep_awake(held, refusals)
     spinning = core is not None and _keep_from_halting(core, held, refusals)
     gc.collect()
@@ -119,18 +119,20 @@ def request_privileges(core_from_last: int = 0, settings: Realtime | None = None
 
 
 @contextmanager
-def temporary_privileges(core_from_last: int = 0, settings: Realtime | None = None) -> Iterator[RealtimePrivileges]:
+def temporary_privileges(
+    core_counted_from_last: int = 0, settings: Realtime | None = None
+) -> Iterator[RealtimePrivileges]:
     """Request the privileges of `request_privileges`, yield what was granted, and give them back after the block.
 
     Args:
-        core_from_last: as for `request_privileges`.
+        core_counted_from_last: as for `request_privileges`.
         settings: as for `request_privileges`.
     """
     policy, cores, collecting = os.sched_getscheduler(0), os.sched_getaffinity(0), gc.isenabled()
     parameter = os.sched_getparam(0)
     granted: RealtimePrivileges | None = None
     try:
-        granted = request_privileges(core_from_last, settings)
+        granted = request_privileges(core_counted_from_last, settings)
         yield granted
     finally:
         if granted is not None:
@@ -251,20 +253,20 @@ def _own_core(cores: list[int], described: bool, held: ExitStack, refusals: list
     return None
 
 
-def halts(driver: Path) -> bool:
+def idle_cores_halt(idle_driver_file: Path) -> bool:
     """Return whether the file says that the idle driver is `none`: then idle cores halt in spite of `LATENCY`.
 
     Args:
-        driver: the file that names it, `IDLE_DRIVER`.
+        idle_driver_file: the file that names it, `IDLE_DRIVER`.
     """
     with suppress(OSError):
-        return driver.read_text(encoding="utf-8").strip() == "none"
+        return idle_driver_file.read_text(encoding="utf-8").strip() == "none"
     return False
 
 
 def _keep_from_halting(core: int, held: ExitStack, refusals: list[str]) -> bool:
     """Keep a core busy at the lowest priority, where a halted one is given back late by whoever runs the machine."""
-    if not halts(IDLE_DRIVER):
+    if not idle_cores_halt(IDLE_DRIVER):
         return False
     ends, lives = os.pipe()
     silent = [(os.POSIX_SPAWN_OPEN, number, os.devnull, os.O_WRONLY, 0) for number in (1, 2)]

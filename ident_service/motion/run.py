@@ -176,7 +176,7 @@ def run(
     controls: Controls | None = None,
     *,
     speed: float = 1.0,
-    latch: ActiveFaults | None = None,
+    active_faults: ActiveFaults | None = None,
     hold_seconds: float = HOLD,
 ) -> RunReport:
     """Enable an open arm, move it along an excitation and back to where it stood; return the report, or raise ArmFault.
@@ -189,7 +189,7 @@ def run(
         controls: commands, read every cycle; None for a run without stop, pause or early finish.
         speed: share of the motion's own speed at which all of it is played, approach, return and ways out of pauses
             too; a rehearsal takes 0.2. Stops are never slowed.
-        latch: the arm's faults, which outlive the run; a new one when None.
+        active_faults: the arm's faults, which outlive the run; a new one when None.
         hold_seconds: time for which a stopped arm is held before the drives brake it by themselves, or it is lowered
             [s].
 
@@ -202,7 +202,15 @@ def run(
         ArmFault: a fault stopped the motion; the arm is without torque, and the fault latched.
         DriverError: the arm refused to be enabled, not because a drive has a fault.
     """
-    return follow(arm, model, ExcitationPlan(excitation, speed), sink, controls, latch=latch, hold_seconds=hold_seconds)
+    return follow(
+        arm,
+        model,
+        ExcitationPlan(excitation, speed),
+        sink,
+        controls,
+        active_faults=active_faults,
+        hold_seconds=hold_seconds,
+    )
 
 
 def follow(
@@ -212,7 +220,7 @@ def follow(
     sink: Sink,
     controls: Controls | None = None,
     *,
-    latch: ActiveFaults | None = None,
+    active_faults: ActiveFaults | None = None,
     hold_seconds: float = HOLD,
 ) -> RunReport:
     """Enable an open arm and move it along the references of a plan; return the report, or raise ArmFault.
@@ -223,7 +231,7 @@ def follow(
         plan: the references to follow.
         sink: sink that takes every sample.
         controls: as for `run`.
-        latch: as for `run`.
+        active_faults: as for `run`.
         hold_seconds: as for `run`; also for the end of a plan that is held.
 
     Returns:
@@ -233,7 +241,9 @@ def follow(
         UsageError, MotionRefused, ArmFault, DriverError: as `run`.
     """
     require_factor(plan.speed)
-    return _Run(arm, model, plan, sink, controls or StopCondition(), latch or ActiveFaults(), hold_seconds).run()
+    return _Run(
+        arm, model, plan, sink, controls or StopCondition(), active_faults or ActiveFaults(), hold_seconds
+    ).run()
 
 
 @dataclass
@@ -367,7 +377,7 @@ class _Run:
     ) -> tuple[Loop, Vector]:
         model, chain, period = self.model, self.model.chain, 1.0 / described.rate
         home = self._home = sample.position.copy()
-        admitted = self.plan.admits(model, home, limits)
+        admitted = self.plan.run_limits(model, home, limits)
         legs, limits = self.plan.legs(model, home, limits), admitted
         observer = frozen_encoder_observer(dynamics, model, limits, period, described.position_resolution)
         contact = Contact(model)
@@ -389,10 +399,10 @@ class _Run:
         holding = control.torque(home, sample.valid, rest(home))
         if described.streams_position:
             # A guard of its own: what drives are given is not compared with this torque.
-            _, cannot_hold = SafetyMonitor(chain.names, limits, period, home).torque(holding)
+            _, cannot_hold = SafetyMonitor(chain.names, limits, period, home).limit_torque(holding)
             target = home
         else:
-            target, cannot_hold = guard.torque(holding)
+            target, cannot_hold = guard.limit_torque(holding)
         if cannot_hold is not None:
             raise MotionRefused(f"the arm cannot be held where it stands: {cannot_hold.message}")
         self.states = StateMachine(self.latch, self._entered)

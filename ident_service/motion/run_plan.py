@@ -48,7 +48,7 @@ class Plan(Protocol):
     def require_possible(self, model: ArmModel, limits: MotionLimits) -> None:
         """Raise MotionRefused where the plan cannot be followed, wherever the arm stands."""
 
-    def admits(self, model: ArmModel, position: Vector, limits: MotionLimits) -> MotionLimits:
+    def run_limits(self, model: ArmModel, position: Vector, limits: MotionLimits) -> MotionLimits:
         """Return the limits of a run from this position [rad or m], (joints,); MotionRefused if it may not begin."""
 
     def legs(self, model: ArmModel, start: Vector, limits: MotionLimits) -> Sequence[Leg]:
@@ -70,7 +70,7 @@ class ExcitationPlan:
         require_within_limits(self.excitation.path, model, limits)
         require_stops_within_limits(self.excitation.path, limits, model.chain.names)
 
-    def admits(self, model: ArmModel, position: Vector, limits: MotionLimits) -> MotionLimits:
+    def run_limits(self, model: ArmModel, position: Vector, limits: MotionLimits) -> MotionLimits:
         """Return `limits` unchanged; raise MotionRefused where a joint stands outside its position limits."""
         if found := position_limit_violations(position, limits, model.chain.names):
             raise MotionRefused(f"outside the position limits: {'; '.join(found)}; `ident recover` says what to do")
@@ -111,7 +111,7 @@ class PointToPointPlan:
     def require_possible(self, model: ArmModel, limits: MotionLimits) -> None:
         """Do nothing: home is inside the limits by the description's own check, as is the nearest posture inside."""
 
-    def admits(self, model: ArmModel, position: Vector, limits: MotionLimits) -> MotionLimits:
+    def run_limits(self, model: ArmModel, position: Vector, limits: MotionLimits) -> MotionLimits:
         """Return limits widened to the arm's position; MotionRefused if too far outside, or if `INSIDE` is reached."""
         require_near(position, limits, model.chain.names)
         if self.destination is Destination.INSIDE and not position_limit_violations(

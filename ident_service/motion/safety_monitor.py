@@ -24,21 +24,23 @@ from ident_service.motion.faults import Reaction as Reaction
 from ident_service.motion.trajectory import Setpoint
 
 
-def fault_from_events(events: Sequence[AxisEvent], names: Sequence[str], findings: FaultCounter) -> Fault | None:
+def fault_from_events(
+    events: Sequence[AxisEvent], joint_names: Sequence[str], fault_counter: FaultCounter
+) -> Fault | None:
     """Make a fault or a counted warning of each event of a sample; return the most severe one, None without events.
 
     Args:
         events: of the sample.
-        names: of the joints.
-        findings: counter that makes the faults and counts every warning.
+        joint_names: of the joints.
+        fault_counter: counter that makes the faults and counts every warning.
 
     Returns:
         The most severe fault, the first of equals; None without events.
     """
     worst: Fault | None = None
     for event in events:
-        whose = "" if event.axis is None else f"{names[event.axis]}: "
-        found = findings.found(event.code.value, f"{whose}{event.words}")
+        whose = "" if event.axis is None else f"{joint_names[event.axis]}: "
+        found = fault_counter.count_fault(event.code.value, f"{whose}{event.words}")
         if worst is None or found.reaction > worst.reaction:
             worst = found
     return worst
@@ -128,12 +130,12 @@ class MonitoredSample:
     most_torque: Vector | None = None
 
 
-def checks(seen: MonitoredSample, limits: MotionLimits) -> Iterator[Check]:
+def checks(monitored: MonitoredSample, limits: MotionLimits) -> Iterator[Check]:
     """Yield all checks of a sample, each with a mask that may be empty; those for untrustworthy data come first."""
-    yield from _what_cannot_be_believed(seen, limits)
-    yield from _quick_stop_checks(seen)
-    yield from _what_must_end(seen, limits)
-    yield from _what_can_be_bridged(seen, limits)
+    yield from _what_cannot_be_believed(monitored, limits)
+    yield from _quick_stop_checks(monitored)
+    yield from _what_must_end(monitored, limits)
+    yield from _what_can_be_bridged(monitored, limits)
 
 
 def _what_cannot_be_believed(seen: MonitoredSample, limits: MotionLimits) -> Iterator[Check]:
@@ -220,20 +222,20 @@ def approach_speed(distance: Vector, limits: MotionLimits) -> Vector:
     return np.asarray(np.sqrt(squared + (ENVELOPE_SLACK * limits.velocity) ** 2))
 
 
-def describe_check(check: Check, names: Sequence[str], units: Sequence[str]) -> str:
+def describe_check(check: Check, joint_names: Sequence[str], joint_units: Sequence[str]) -> str:
     """Describe a violated check in words: the joints concerned, and what was measured.
 
     Args:
         check: check with at least one hit.
-        names: of the joints.
-        units: units of the joints' positions.
+        joint_names: of the joints.
+        joint_units: units of the joints' positions.
     """
     hit: list[int] = np.flatnonzero(check.hit).tolist()
-    names = check.names or names
+    joint_names = check.names or joint_names
     texts = [", ".join(f"{number[k]:.4g}" for k in hit) for number in check.numbers]
-    unit = "" if check.names else units[hit[0]]
+    unit = "" if check.names else joint_units[hit[0]]
     force = {"rad": "N m", "m": "N"}.get(unit, "")
-    return f"{', '.join(dict.fromkeys(names[k] for k in hit))}: {check.what.format(*texts, u=unit, f=force)}"
+    return f"{', '.join(dict.fromkeys(joint_names[k] for k in hit))}: {check.what.format(*texts, u=unit, f=force)}"
 
 
 def _limit_excess(position: Vector, limits: MotionLimits) -> tuple[Vector, Vector]:
@@ -348,18 +350,18 @@ class SafetyMonitor:
         """Return how often each warning was found, by code."""
         return self.findings.warnings
 
-    def feedback(
+    def check_feedback(
         self,
         sample: Sample,
         reference: Setpoint,
         velocity: Vector,
-        correction: Vector,
+        feedback_torque: Vector,
         feedback_acceleration: Vector | None = None,
         elapsed: float | None = None,
-        feedforward: Vector | float = 0.0,
+        friction_feedforward: Vector | float = 0.0,
         *,
-        known: bool = True,
-        unexplained: Vector | None = None,
+        elapsed_is_exact: bool = True,
+        unexplained_torque: Vector | None = None,
     ) -> tuple[Flags, Fault | None]:
         """Check a sample against all thresholds; return a mask of usable positions and the most severe fault or None.
 
@@ -367,15 +369,15 @@ class SafetyMonitor:
             sample: of this cycle.
             reference: setpoint at the sample's stamp.
             velocity: filtered velocity before this sample [rad/s or m/s], shape (joints,).
-            correction: feedback part of the torque before this sample [N m or N], shape (joints,).
+            feedback_torque: feedback part of the torque before this sample [N m or N], shape (joints,).
             feedback_acceleration: the acceleration in that torque [rad/s^2 or m/s^2], shape (joints,); without it,
                 `encoder_observer` is not updated.
             elapsed: time since the sample before [s]; one period when None.
-            known: whether `elapsed` is the true time; if not, it is the longest that it may be.
-            feedforward: friction in the torque before this sample [N m or N], shape (joints,), which pushes a joint
-                against its own friction as the correction does.
-            unexplained: torque that drives which are given positions measure beside the model's [N m or N], shape
-                (joints,), by which they push a joint on their own; None where none is known.
+            elapsed_is_exact: whether `elapsed` is the true time; if not, it is the longest that it may be.
+            friction_feedforward: friction in the torque before this sample [N m or N], shape (joints,), which pushes a
+                joint against its own friction as the feedback torque does.
+            unexplained_torque: torque that drives which are given positions measure beside the model's [N m or N],
+                shape (joints,), by which they push a joint on their own; None where none is known.
 
         Returns:
             Which axes' positions may be used, and the most severe fault found, if any.
@@ -383,13 +385,13 @@ class SafetyMonitor:
         self.findings.cycle += 1
         if self.findings.cycle == self._powered_by:
             self._was_powered, self._healthy = np.ones_like(self._was_powered), ()
-        self._elapsed, self._known = self._period if elapsed is None else elapsed, known
+        self._elapsed, self._known = self._period if elapsed is None else elapsed, elapsed_is_exact
         answered = all(sample.valid.tolist())
         encoders = self._encoders
         steps, valid = encoders.steps(sample.position, self._shown), encoders.valid(sample.valid)
-        pushed = np.abs(encoders.forces(correction + feedforward))
-        if unexplained is not None:
-            pushed = np.maximum(pushed, np.abs(encoders.forces(unexplained)))
+        pushed = np.abs(encoders.forces(feedback_torque + friction_feedforward))
+        if unexplained_torque is not None:
+            pushed = np.maximum(pushed, np.abs(encoders.forces(unexplained_torque)))
         self._count_stationary_cycles(steps, valid, pushed)
         same = (steps == 0.0) & valid
         if self._most_torque is not None:
@@ -400,7 +402,7 @@ class SafetyMonitor:
         if self._encoder_observer is not None and feedback_acceleration is not None:
             seen = np.where(valid, steps, 0.0)
             self._owes = self._encoder_observer.update(
-                seen, correction, feedback_acceleration, self._position, feedforward
+                seen, feedback_torque, feedback_acceleration, self._position, friction_feedforward
             )
         held = answered and self._all_fresh and self._quiet(sample.position, reference.position, velocity)
         if held and self._plain(sample):
@@ -411,7 +413,7 @@ class SafetyMonitor:
             with np.errstate(all="ignore"):
                 usable, fault = self._judged(sample, reference.position, velocity)
         if self._most_torque is not None:
-            pushes = self._count_pushes(self._none if unexplained is None else unexplained)
+            pushes = self._count_pushes(self._none if unexplained_torque is None else unexplained_torque)
             fault = pushes if pushes is not None and (fault is None or fault.reaction < pushes.reaction) else fault
         if sample.events:
             event = fault_from_events(sample.events, self._names, self.findings)
@@ -420,38 +422,38 @@ class SafetyMonitor:
                 fault = event
         return usable, fault
 
-    def torque(self, wanted: Vector) -> tuple[Vector, Fault | None]:
+    def limit_torque(self, computed_torque: Vector) -> tuple[Vector, Fault | None]:
         """Return the torque limited in size and rate (the first in size only; 0 if refused), and its fault or None.
 
         Args:
-            wanted: torque demanded by the controller [N m or N], shape (joints,).
+            computed_torque: torque demanded by the controller [N m or N], shape (joints,).
 
         Returns:
             The torque that may leave: within limits, or zero when the fault takes torque away. The first one is not
             limited in rate, because the support yields to it.
         """
         limit, before, motors = self._limits.torque, self._sent, self._limits.motors
-        size = np.abs(wanted)
+        size = np.abs(computed_torque)
         if (
             all((size <= limit).tolist())
-            and (motors is None or all((motors.used(wanted) <= 1.0).tolist()))
-            and (before is None or all((np.abs(wanted - before) <= self.rate).tolist()))
+            and (motors is None or all((motors.used(computed_torque) <= 1.0).tolist()))
+            and (before is None or all((np.abs(computed_torque - before) <= self.rate).tolist()))
         ):
-            self._sent = wanted
-            return wanted, None
-        finite = np.isfinite(wanted)
+            self._sent = computed_torque
+            return computed_torque, None
+        finite = np.isfinite(computed_torque)
         what = f"a torque of {{}} {{f}} was requested, more than {ABSURD:g} times the limit of {{}}"
         for check in (
             Check("torque_not_finite", ~finite, "the requested torque is not a number"),
-            Check("torque_absurd", finite & (size > ABSURD * limit), what, (wanted, limit)),
+            Check("torque_absurd", finite & (size > ABSURD * limit), what, (computed_torque, limit)),
         ):
             if check.hit.any():
                 return np.zeros_like(limit), self._found(check)
-        leaves = np.clip(wanted, -limit, limit)
+        leaves = np.clip(computed_torque, -limit, limit)
         over, fault = size > limit, None
         if over.any():
             what = "a torque of {} {f} was requested, the limit is {}"
-            fault = self._found(Check("torque_saturated", over, what, (wanted, limit)))
+            fault = self._found(Check("torque_saturated", over, what, (computed_torque, limit)))
         if motors is not None and (over := motors.used(leaves) > 1.0).any():
             what = "a torque of {} N m was requested, the limit is {}"
             asked = leaves @ motors.to_motors.T
@@ -466,33 +468,33 @@ class SafetyMonitor:
         self._sent = leaves
         return leaves, fault
 
-    def position(self, wanted: Vector) -> tuple[Vector, Fault | None]:
+    def limit_position(self, reference_position: Vector) -> tuple[Vector, Fault | None]:
         """Return the position limited in step for the drives (the last one if refused), and its fault or None.
 
         Args:
-            wanted: position demanded by the trajectory [rad or m], shape (joints,).
+            reference_position: position demanded by the trajectory [rad or m], shape (joints,).
 
         Returns:
             The position that may leave: no farther from the last one than the joints move in a cycle at `VELOCITY_STOP`
             times their velocity limit, first from where the arm stands; the last one when the fault ends motion.
         """
-        finite = np.isfinite(wanted)
+        finite = np.isfinite(reference_position)
         if not finite.all():
             return self._target, self._found(
                 Check("position_not_finite", ~finite, "the position asked for is no number")
             )
-        beyond, limit = _limit_excess(wanted, self._limits)
+        beyond, limit = _limit_excess(reference_position, self._limits)
         if (outside := beyond > _ROUNDING).any():
             what = "a position of {} {u} was asked for, the limit is {} {u}"
-            return self._target, self._found(Check("position_outside", outside, what, (wanted, limit)))
-        step, most = wanted - self._target, VELOCITY_STOP * self._limits.velocity * self._period
+            return self._target, self._found(Check("position_outside", outside, what, (reference_position, limit)))
+        step, most = reference_position - self._target, VELOCITY_STOP * self._limits.velocity * self._period
         fast, fault = np.abs(step) > most, None
         if fast.any():
             what = "the position was to change by {} {u} in a cycle, {} {u} allowed"
             fault = self._found(Check("position_rate", fast, what, (step, most)))
-            wanted = self._target + np.clip(step, -most, most)
-        self._target = wanted
-        return wanted, fault
+            reference_position = self._target + np.clip(step, -most, most)
+        self._target = reference_position
+        return reference_position, fault
 
     def _rate_limited(self, before: Vector, wanted: Vector) -> Vector:
         """Return the torque on the way from the last one to the one wanted that the rate allows."""
@@ -504,9 +506,9 @@ class SafetyMonitor:
         share = np.minimum(1.0, self.rate / np.maximum(change, self.rate))
         return np.asarray(before + np.where(self._joined, share, 1.0).min(axis=1) * (wanted - before))
 
-    def about(self, joint: int, what: str, velocity: float) -> str:
-        """Return a joint's name, a colon and `what`, whose `{}` becomes the velocity [rad/s or m/s] with its unit."""
-        return f"{self._names[joint]}: {what.format(f'{velocity:.4g} {self._units[joint]}/s')}"
+    def joint_message(self, joint_index: int, template: str, velocity: float) -> str:
+        """Return a joint's name, a colon and `template`, its `{}` replaced by the velocity [rad/s or m/s] with unit."""
+        return f"{self._names[joint_index]}: {template.format(f'{velocity:.4g} {self._units[joint_index]}/s')}"
 
     def _quiet(self, position: Vector, wanted: Vector, velocity: Vector) -> bool:
         """Return whether positions that all answered keep every position, velocity, following and jump threshold."""
@@ -647,4 +649,4 @@ class SafetyMonitor:
         return self._encoders.at_joints(flags)
 
     def _found(self, check: Check) -> Fault:
-        return self.findings.found(check.code, describe_check(check, self._names, self._units))
+        return self.findings.count_fault(check.code, describe_check(check, self._names, self._units))

@@ -17,7 +17,7 @@ from ident_service.motion.clearance import ClearanceChecker
 from ident_service.motion.run_plan import HOMING_SPEED
 from ident_service.motion.speed_scaling import slowed_limits
 from ident_service.motion.state_machine import MOVING, STOPPABLE, State, StateMachine
-from ident_service.motion.stop_trajectory import stop
+from ident_service.motion.stop_trajectory import plan_stop
 from ident_service.motion.trajectory import (
     Reference,
     RuckigReference,
@@ -52,7 +52,7 @@ class Paused:
         """
         self._motion = motion
         self._limits = limits
-        self._stop = stop(motion.at(time) if start is None else start, limits)
+        self._stop = plan_stop(motion.at(time) if start is None else start, limits)
         self.time = min(time, motion.duration)
         self.duration = self._stop.duration
 
@@ -237,7 +237,7 @@ class TrajectorySequencer:
         """Enter STOPPING and follow a controlled stop from the reference; do nothing in states that allow none."""
         if self._states.state in STOPPABLE:
             self._states.enter(State.STOPPING)
-            self._begin_ns, self._way = stamp_ns, stop(self.reference, self._limits)
+            self._begin_ns, self._way = stamp_ns, plan_stop(self.reference, self._limits)
 
     def pause(self, stamp_ns: int) -> None:
         """Enter PAUSING and follow a stop from which the motion can resume; do nothing where the arm does not move."""

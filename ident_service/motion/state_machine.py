@@ -69,16 +69,16 @@ class StateMachine:
         self._latch = latch
         self._observer = observer
 
-    def enter(self, wanted: State) -> None:
+    def enter(self, state: State) -> None:
         """Enter a state and tell the observer; ArmError without such a transition, or where active faults forbid it.
 
         Raises:
             ArmError: no transition leads there, a mistake of the program; or an unacknowledged fault forbids it.
         """
-        if wanted not in TRANSITIONS[self.state]:
-            raise ArmError(f"no transition from {self.state.value} to {wanted.value}")
-        waits = wanted is State.ARMED or (self.state is State.FAULTED and wanted is State.IDLE)
+        if state not in TRANSITIONS[self.state]:
+            raise ArmError(f"no transition from {self.state.value} to {state.value}")
+        waits = state is State.ARMED or (self.state is State.FAULTED and state is State.IDLE)
         if waits and self._latch.faults:
-            raise ArmError(f"no transition to {wanted.value} before {self._latch.faults[0].code} is acknowledged")
-        self.state = wanted
-        self._observer(wanted)
+            raise ArmError(f"no transition to {state.value} before {self._latch.faults[0].code} is acknowledged")
+        self.state = state
+        self._observer(state)

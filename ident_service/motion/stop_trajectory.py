@@ -55,7 +55,7 @@ class StopProfile:
         """
         knots = [start]
         for jerk, length in pieces:
-            knots.append(after(knots[-1], jerk, length))
+            knots.append(state_after(knots[-1], jerk, length))
         # The last velocity and acceleration are zero but for rounding, which must not grow into a drift.
         knots[-1] = Setpoint(knots[-1].position, 0.0 * knots[-1].velocity, 0.0 * knots[-1].acceleration)
         still = np.zeros_like(start.position)
@@ -75,7 +75,7 @@ class StopProfile:
         here = ((self._begin <= time).sum(axis=0) - 1, self._joint)
         knot = Setpoint(self._position[here], self._velocity[here], self._acceleration[here])
         with np.errstate(all="ignore"):  # NaN and infinity are for the guard to judge, in the same cycle
-            return after(knot, self._jerk[here], time - self._begin[here])
+            return state_after(knot, self._jerk[here], time - self._begin[here])
 
     def extent(self) -> tuple[Vector, Vector]:
         """Return the lowest and highest position on the profile, exact but for rounding, shape (..., joints) each."""
@@ -86,11 +86,11 @@ class StopProfile:
             sum_ = -(acceleration + np.copysign(root, acceleration))
             turns = [np.fmin(np.fmax(turn, 0.0), self._length) for turn in (2.0 * velocity / sum_, sum_ / jerk)]
         knot = Setpoint(self._position, velocity, acceleration)
-        seen = np.stack([self._position, *(after(knot, jerk, turn).position for turn in turns)])
+        seen = np.stack([self._position, *(state_after(knot, jerk, turn).position for turn in turns)])
         return seen.min(axis=(0, 1)), seen.max(axis=(0, 1))
 
 
-def after(start: Setpoint, jerk: Vector, time: Vector) -> Setpoint:
+def state_after(start: Setpoint, jerk: Vector, time: Vector) -> Setpoint:
     """Return the state `time` [s] later under a constant `jerk`, shaped like the position."""
     velocity = start.velocity + time * (start.acceleration + time * jerk / 2.0)
     position = start.position + time * (start.velocity + time * (start.acceleration / 2.0 + time * jerk / 6.0))
@@ -101,7 +101,7 @@ _STEP = 5e-3  # s
 _BLOCK = 4096  # samples judged at once, so that a long motion needs no more memory than a short one
 
 
-def stop(start: Setpoint, limits: MotionLimits) -> StopProfile:
+def plan_stop(start: Setpoint, limits: MotionLimits) -> StopProfile:
     """Return the controlled stop from any state to rest, within acceleration and jerk limits; never raises.
 
     Args:
@@ -118,45 +118,45 @@ def stop(start: Setpoint, limits: MotionLimits) -> StopProfile:
         return _braked(start, limits, np.where(hard_leaves < quick_leaves, side, 0.0))
 
 
-def stop_extent(path: MotionPath, limits: MotionLimits) -> tuple[Vector, Vector]:
+def stop_extent(motion: MotionPath, limits: MotionLimits) -> tuple[Vector, Vector]:
     """Return the lowest and highest positions of a motion and of stops out of it at sampled times [rad or m].
 
     Between two sampled times it may be exceeded slightly; and where stops come so close to a position limit that
     some must brake harder, by how far these settle back from there. Neither leads outside the limits: see above.
 
     Args:
-        path: sampled every 5 ms in its distinct parts.
+        motion: sampled every 5 ms in its distinct parts.
         limits: limits that the stops keep.
 
     Returns:
         Two arrays [rad or m], shape (joints,).
     """
-    lowest, highest = np.full(path.joints, np.inf), np.full(path.joints, -np.inf)
-    for times in _sampled(path):
-        position, velocity, acceleration, _ = path.at(times)
-        low, high = stop(Setpoint(position, velocity, acceleration), limits).extent()
+    lowest, highest = np.full(motion.joints, np.inf), np.full(motion.joints, -np.inf)
+    for times in _sampled(motion):
+        position, velocity, acceleration, _ = motion.at(times)
+        low, high = plan_stop(Setpoint(position, velocity, acceleration), limits).extent()
         np.minimum(lowest, low.min(axis=0), out=lowest)
         np.maximum(highest, high.max(axis=0), out=highest)
     return lowest, highest
 
 
-def require_stops_within_limits(path: MotionPath, limits: MotionLimits, names: tuple[str, ...]) -> None:
+def require_stops_within_limits(motion: MotionPath, limits: MotionLimits, joint_names: tuple[str, ...]) -> None:
     """Raise MotionRefused where a stop out of the motion, sampled every 5 ms, would leave a joint's position limits.
 
     Args:
-        path: the motion.
+        motion: the motion.
         limits: of the arm.
-        names: of the joints, for the message.
+        joint_names: of the joints, for the message.
 
     Raises:
         MotionRefused: naming every joint and how far it would go.
     """
-    lowest, highest = stop_extent(path, limits)
+    lowest, highest = stop_extent(motion, limits)
     # Rounding of a stop that turns exactly at its limit.
     slack = 1e-9 * (1.0 + np.maximum(np.abs(limits.lower), np.abs(limits.upper)))
     found = [
         f"{name}: {low:.3f}..{high:.3f} leaves {limits.lower[k]:g}..{limits.upper[k]:g}"
-        for k, (name, low, high) in enumerate(zip(names, lowest, highest, strict=True))
+        for k, (name, low, high) in enumerate(zip(joint_names, lowest, highest, strict=True))
         if not (low >= limits.lower[k] - slack[k] and high <= limits.upper[k] + slack[k])  # NaN too
     ]
     if found:
@@ -185,7 +185,7 @@ def _braked(start: Setpoint, limits: MotionLimits, side: Vector) -> StopProfile:
     state = start
     for piece in (_return_to_limit, _ramped, _held):
         pieces.append(piece(state, limits, side))
-        state = after(state, *pieces[-1])
+        state = state_after(state, *pieces[-1])
     return StopProfile(start, [*pieces, *_quickest_stop(state, limits)])
 
 

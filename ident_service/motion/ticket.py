@@ -1,6 +1,6 @@
 """Judge preflight checks, and write the ticket: what was found, for which arm, motion, model and software.
 
-One JSON object of format `ident-ticket`. The code that moves the arm asks it `valid_for` the motion; any change
+One JSON object of format `ident-ticket`. The code that moves the arm asks it for `objections_to` the motion; any change
 since asks for a new check. It is a record, not a signature: it protects against mistakes, not against people.
 """
 
@@ -113,7 +113,7 @@ class Check:
 
 
 def measure(
-    what: str,
+    quantity: str,
     value: float | None,
     unit: str,
     *,
@@ -126,14 +126,14 @@ def measure(
     def plain(number: float | None) -> float | None:
         return None if number is None or not isfinite(number) else float(number)
 
-    return Measure(what, plain(value), unit, joint, plain(least), plain(most))
+    return Measure(quantity, plain(value), unit, joint, plain(least), plain(most))
 
 
 def measures(
-    what: str,
+    quantity: str,
     values: Vector,
     units: Sequence[str],
-    names: Sequence[str],
+    joint_names: Sequence[str],
     *,
     least: Vector | None = None,
     most: Vector | None = None,
@@ -141,31 +141,31 @@ def measures(
     """Create one measure per joint, each of the value, unit, name and limits at its index."""
     return tuple(
         measure(
-            what,
+            quantity,
             float(values[k]),
             units[k],
             joint=name,
             least=None if least is None else float(least[k]),
             most=None if most is None else float(most[k]),
         )
-        for k, name in enumerate(names)
+        for k, name in enumerate(joint_names)
     )
 
 
-def check_from_measures(code: str, found: Sequence[Measure], remedy: str) -> Check:
+def check_from_measures(code: str, taken: Sequence[Measure], remedy: str) -> Check:
     """Return a check: passed where every measure keeps its limits, else failed, naming each that does not."""
-    broken = [str(one) for one in found if not one.within_limits]
+    broken = [str(one) for one in taken if not one.within_limits]
     if broken:
-        return Check(code, Verdict.FAILED, tuple(found), "; ".join(broken), remedy)
-    return Check(code, Verdict.PASSED, tuple(found))
+        return Check(code, Verdict.FAILED, tuple(taken), "; ".join(broken), remedy)
+    return Check(code, Verdict.PASSED, tuple(taken))
 
 
-def failed(code: str, reason: str, remedy: str, found: Sequence[Measure] = ()) -> Check:
+def failed_check(code: str, reason: str, remedy: str, measured: Sequence[Measure] = ()) -> Check:
     """Return a check with the verdict FAILED, its reason and remedy."""
-    return Check(code, Verdict.FAILED, tuple(found), reason, remedy)
+    return Check(code, Verdict.FAILED, tuple(measured), reason, remedy)
 
 
-def skipped(code: str, reason: str) -> Check:
+def skipped_check(code: str, reason: str) -> Check:
     """Return a check with the verdict SKIPPED and the reason why it was not made."""
     return Check(code, Verdict.SKIPPED, (), reason)
 
@@ -234,7 +234,7 @@ class Ticket:
     def verdict(self) -> Verdict:
         """Return FAILED or NEEDS_PERSON if a check has it, else PASSED if all indispensable ones passed, else FAILED.
 
-        Without an indispensable check `valid_for` would allow nothing.
+        Without an indispensable check `objections_to` would allow nothing.
         """
         found = {check.verdict for check in self.checks}
         for worse in (Verdict.FAILED, Verdict.NEEDS_PERSON):
@@ -246,7 +246,7 @@ class Ticket:
     def _verdicts(self, code: str) -> set[Verdict]:
         return {check.verdict for check in self.checks if check.code == code}
 
-    def valid_for(self, subject: Subject, now: datetime) -> list[str]:
+    def objections_to(self, subject: Subject, now: datetime) -> list[str]:
         """Return the reasons why this ticket does not allow a motion now, by checks, age and subject; empty if it does.
 
         Args:
@@ -283,8 +283,8 @@ class Ticket:
         return found
 
     def require_valid_for(self, subject: Subject, now: datetime) -> None:
-        """Raise MotionRefused with the reasons of `valid_for` where this ticket does not allow the motion now."""
-        if why := self.valid_for(subject, now):
+        """Raise MotionRefused with the reasons of `objections_to` where this ticket does not allow the motion now."""
+        if why := self.objections_to(subject, now):
             raise MotionRefused(
                 f"the preflight ticket is not valid for this: {'; '.join(why)}; `ident preflight` makes a new one"
             )
@@ -339,10 +339,10 @@ def subject_of(model: ArmModel, excitation: Excitation | None, described: ArmDes
     )
 
 
-def new_ticket(subject: Subject, checks: Sequence[Check], now_ns: int, valid: timedelta = VALID) -> Ticket:
-    """Create a ticket made at `now_ns` [ns since 1970 in UTC] that expires after `valid`."""
+def new_ticket(subject: Subject, checks: Sequence[Check], now_ns: int, validity: timedelta = VALID) -> Ticket:
+    """Create a ticket made at `now_ns` [ns since 1970 in UTC] that expires after `validity`."""
     created = utc(now_ns)
-    return Ticket(subject, tuple(checks), created, created + valid)
+    return Ticket(subject, tuple(checks), created, created + validity)
 
 
 def utc(now_ns: int) -> datetime:

@@ -18,14 +18,14 @@ from typing import Any
 from drivers.can.bus_state import BusError
 from drivers.can.can_link import Link, open_links
 from drivers.canopen import object_dictionary as od
-from drivers.canopen.bus_scan import asking, hearing
-from drivers.canopen.capabilities import required, where
+from drivers.canopen.bus_scan import buses_to_ask, hearing
+from drivers.canopen.capabilities import entry_text, require_capabilities
 from drivers.canopen.cia402 import POWER_OFF, state_of
 from drivers.canopen.drive_setup import DriveConfiguration, configure, identify, motor_limits, quick_stop_option
 from drivers.canopen.motor_units import coordinates
 from drivers.canopen.object_dictionary import Entry, Kind
 from drivers.canopen.pdo_mapping import Write, bus_profiles
-from drivers.canopen.sdo import Change, DryRunObjects, Objects, optional
+from drivers.canopen.sdo import Change, DryRunObjects, Objects, none_if_missing
 from drivers.canopen.stored_zero import zeros_of
 from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanopenDriver
@@ -70,20 +70,20 @@ def planned_configuration(
     profiles = {profile.number: profile for profile in bus_profiles(driver, config.control.rate)}
     found, zeros, option = coordinates(driver, gears), zeros_of(config), quick_stop_option(config)
     planned: list[PlannedDrive] = []
-    with asking(config, open_bus) as (_, links, heard):
+    with buses_to_ask(config, open_bus) as (_, links, heard):
         every = [
             DryRunObjects(links[one.bus], one.node, hearing(heard, one.bus), _fixed(sheet))
             for one, sheet in zip(driver.drives, driver.sheets, strict=True)
         ]
         if zeros is not None:
-            held = [zeros.held(objects, number) for number, objects in enumerate(every)]
+            held = [zeros.stored_counts(objects, number) for number, objects in enumerate(every)]
             if known := [counts for counts in held if counts is not None]:
                 found = found.zeroed(known, zeros.home) if len(known) == len(held) else found
         motors = motor_limits(config, found)
         for number, (drive, objects) in enumerate(zip(driver.drives, every, strict=True)):
             with _planning(number, objects, planned):
                 identify(objects, drive.identity)
-                own = driver.reactions, option, motors[number], required(objects, driver, number)
+                own = driver.reactions, option, motors[number], require_capabilities(objects, driver, number)
                 configure(objects, DriveConfiguration(drive, profiles[drive.bus], *own))
     return tuple(planned)
 
@@ -105,13 +105,13 @@ def planned_zero(
     if (zeros := zeros_of(config)) is None:
         raise DriverError(f"{config.name}: its encoders know their position (driver.zero: absolute); no home is set")
     planned: list[PlannedDrive] = []
-    with asking(config, open_bus) as (_, links, heard):
+    with buses_to_ask(config, open_bus) as (_, links, heard):
         for number, drive in enumerate(driver.drives):
             objects = DryRunObjects(links[drive.bus], drive.node, hearing(heard, drive.bus))
             with _planning(number, objects, planned):
                 _require_off(objects)
                 zeros.require_volatile_storage(objects)
-                zeros.keep(objects, number, objects.read(od.POSITION))
+                zeros.store(objects, number, objects.read(od.POSITION))
     return tuple(planned)
 
 
@@ -212,7 +212,7 @@ def import_configuration(
         raise UsageError(f"{len(files)} files for {len(driver.drives)} drives; give one DCF for each, in their order")
     wanted = [_configured(file, drive.node) for file, drive in zip(files, driver.drives, strict=True)]
     left_out = [_left_out(file) for file in files]
-    with asking(config, open_bus) as (_, links, heard):
+    with buses_to_ask(config, open_bus) as (_, links, heard):
         every = [
             (DryRunObjects if dry else Objects)(links[one.bus], one.node, hearing(heard, one.bus))
             for one in driver.drives
@@ -230,7 +230,7 @@ def import_configuration(
                 for key, write in writes.items():
                     if key not in ours and not objects.holds(write):
                         changes.append(Change(write.entry, objects.read(write.entry), write.value))
-                        objects.set(write)
+                        objects.write_verified(write)
                 same = len(writes) - len(ours) - len(changes)
                 outcome = tuple(changes), same, len(ours), left_out[number - 1]
                 done.append(ImportedDrive(number, objects.node, file.name, *outcome))
@@ -283,7 +283,7 @@ def _left_out(file: TextFile) -> dict[str, str]:
     for key, entry in sorted(data_sheet(file.text).entries.items()):
         if not entry.place or key >> 8 in _OURS:
             continue
-        name = where(Entry(key >> 8, key & 0xFF, Kind.U32, ""))
+        name = entry_text(Entry(key >> 8, key & 0xFF, Kind.U32, ""))
         if not entry.writable:
             found[name] = "read-only"
         elif not entry.readable:
@@ -323,7 +323,7 @@ def _value(key: int, entry: DataSheetEntry, kind: Kind, node: int) -> int:
     if key >> 8 not in _OURS and least <= low < high <= greatest and (low, high) != (least, greatest):
         least, greatest, of = low, high, "the file's LowLimit and HighLimit"
     if not least <= value <= greatest:
-        raise ValueError(f"{where(Entry(key >> 8, key & 0xFF, kind, ''))} holds {least} to {greatest}, by {of}")
+        raise ValueError(f"{entry_text(Entry(key >> 8, key & 0xFF, kind, ''))} holds {least} to {greatest}, by {of}")
     return value
 
 
@@ -345,7 +345,7 @@ def _all_set_back(touched: Sequence[tuple[Objects, Sequence[Change]]]) -> str:
     if not any(changes and not objects.dry for objects, changes in touched):
         return "nothing was written"
     lost = [
-        f"node {objects.node} {where(change.entry)}"
+        f"node {objects.node} {entry_text(change.entry)}"
         for objects, changes in reversed(touched)
         for change in reversed(changes)
         if not _is_set_back(objects, change)
@@ -387,14 +387,14 @@ def store_or_restore(
             nothing has been written. Or one refused it: the message names those that have done it.
     """
     driver, entry = require_drives(config), od.STORED if store else od.RESTORE
-    with asking(config, open_bus) as (_, links, heard):
+    with buses_to_ask(config, open_bus) as (_, links, heard):
         kind = DryRunObjects if dry else Objects
         every = [kind(links[one.bus], one.node, hearing(heard, one.bus)) for one in driver.drives]
         for objects in every:
             _require_off(objects)
-            if optional(objects.read, entry) is None:
-                raise DriverError(f"node {objects.node}: has no {where(entry)}; use its maker's tool")
-            mark: int | None = optional(objects.read, od.ZERO_MARK)
+            if none_if_missing(objects.read, entry) is None:
+                raise DriverError(f"node {objects.node}: has no {entry_text(entry)}; use its maker's tool")
+            mark: int | None = none_if_missing(objects.read, od.ZERO_MARK)
             if store and mark:
                 raise DriverError(
                     f"node {objects.node}: holds a zero (1020h), which must be lost with its power: switch the drives"
@@ -444,7 +444,7 @@ def _change_lines(changes: Sequence[Change]) -> Iterator[str]:
     for change in changes:
         before = "?" if change.before is None else f"{change.before} ({_hex(change, change.before)})"
         after = f"{change.after} ({_hex(change, change.after)})"
-        yield f"  {where(change.entry):<16}{before} -> {after}  {change.entry.name}"
+        yield f"  {entry_text(change.entry):<16}{before} -> {after}  {change.entry.name}"
 
 
 def _hex(change: Change, value: int) -> str:
@@ -462,4 +462,4 @@ def drives_document(
 
 def _document(change: Change) -> dict[str, Any]:
     entry = change.entry
-    return {"entry": where(entry), "name": entry.name, "before": change.before, "after": change.after}
+    return {"entry": entry_text(entry), "name": entry.name, "before": change.before, "after": change.after}

@@ -25,18 +25,18 @@ from drivers.can.bus_state import BusError
 from drivers.can.can_link import Link, open_links
 from drivers.can.frame_log import SessionLog, logged_links
 from drivers.canopen.bus_load import budget
-from drivers.canopen.bus_scan import FoundNode, asking, hearing, scan
+from drivers.canopen.bus_scan import FoundNode, buses_to_ask, hearing, scan
 from drivers.canopen.capabilities import (
     Capabilities,
     assess,
     capabilities,
     entries_from_sheet,
-    named,
+    entry_text,
     parse_entry,
-    where,
+    readable_entry,
 )
 from drivers.canopen.cia402 import drive_words, emergency_words, register_words, state_of
-from drivers.canopen.drive_setup import IDENTITY, differences
+from drivers.canopen.drive_setup import IDENTITY, identity_differences
 from drivers.canopen.pdo_mapping import bus_profiles
 from drivers.canopen.sdo import Objects
 from ident_service.config.arm import ArmConfig
@@ -269,7 +269,7 @@ def _judged(node: FoundNode | None, drive: CanopenDrive) -> tuple[Match, str]:
     if not node.is_drive:
         kind = "not told" if node.device_type is None else f"{node.device_type:08X}h"
         return Match.OTHER, f"no drive of CiA 402 (1000h is {kind})"
-    if others := differences(node.identity, drive.identity):
+    if others := identity_differences(node.identity, drive.identity):
         return Match.OTHER, ", ".join(others)
     return Match.CONFIGURED, ""
 
@@ -426,7 +426,7 @@ def bus_probe(
     if data_sheets:
         probed = [_of_file(driver, number % len(driver.drives), one) for number, one in enumerate(data_sheets)]
     else:
-        with asking(config, open_bus) as (_, links, heard):
+        with buses_to_ask(config, open_bus) as (_, links, heard):
             probed = []
             for number, drive in enumerate(driver.drives):
                 objects = Objects(links[drive.bus], drive.node, hearing(heard, drive.bus))
@@ -572,12 +572,12 @@ def _capability_rows(one: Probed, found: Probe) -> dict[str, str]:
     if can.torque is None:
         return facts
     unit = can.family.unit
-    of = "" if unit is None or unit.rated is None else f", by {named(unit.rated)} in {unit.unit}"
+    of = "" if unit is None or unit.rated is None else f", by {readable_entry(unit.rated)} in {unit.unit}"
     count = "unknown" if can.count is None else f"{can.count:.4g} N m"
-    mode = f"mode {can.torque.mode}" + (f" ({named(can.torque.by.entry)})" if can.torque.by else "")
-    facts["torque"] = f"{mode}, {named(can.torque.target)}; a count is {count}{of}"
-    facts["torque_limit"] = "none" if can.limit is None else named(can.limit.entry)
-    facts["speed_limit"] = "set by the host" if can.speed is None else where(can.speed)
+    mode = f"mode {can.torque.mode}" + (f" ({readable_entry(can.torque.by.entry)})" if can.torque.by else "")
+    facts["torque"] = f"{mode}, {readable_entry(can.torque.target)}; a count is {count}{of}"
+    facts["torque_limit"] = "none" if can.limit is None else readable_entry(can.limit.entry)
+    facts["speed_limit"] = "set by the host" if can.speed is None else entry_text(can.speed)
     better = can.more_trusted
     facts["watchdogs"] = (", ".join(can.watchdogs) or "none") + (f"; {better}" if better else "")
     dummies = ", ".join(f"{dummy:04X}h" for dummy in can.dummies)
@@ -587,7 +587,7 @@ def _capability_rows(one: Probed, found: Probe) -> dict[str, str]:
     facts["status_reports"] = "with each position" if can.beside else by_itself
     if (brake := can.family.brake) is not None:
         held = can.found.get(parse_entry(brake, ""))
-        facts["brake"] = f"{named(brake)}, set up by the maker's tool: {'not known' if held is None else held}"
+        facts["brake"] = f"{readable_entry(brake)}, set up by the maker's tool: {'not known' if held is None else held}"
     facts["proved"] = "on hardware" if can.family.proved else "not on hardware"
     return facts
 
@@ -623,7 +623,7 @@ def _document(one: Probed, found: Probe) -> dict[str, Any]:
             "target": None if can.torque is None else can.torque.target,
             "count": can.count,
             "torque_limit": None if can.limit is None else can.limit.entry,
-            "speed_limit": None if can.speed is None else where(can.speed),
+            "speed_limit": None if can.speed is None else entry_text(can.speed),
             "watchdogs": list(can.watchdogs),
             "shares": can.shares,
             "dummies": list(can.dummies),

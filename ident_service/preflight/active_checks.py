@@ -27,11 +27,19 @@ from ident_service.model.zero_phase import local_polynomial
 from ident_service.motion.clearance import trajectory_clearance
 from ident_service.motion.encoder_observer import STANDING
 from ident_service.motion.safety_monitor import TORQUE_RATE, TORQUE_RATE_SHARE
-from ident_service.motion.ticket import Check, Measure, Verdict, check_from_measures, failed, joint_units, measures
+from ident_service.motion.ticket import (
+    Check,
+    Measure,
+    Verdict,
+    check_from_measures,
+    failed_check,
+    joint_units,
+    measures,
+)
 from ident_service.motion.trajectory import Reference, RuckigReference, Setpoint, plan_trajectory, rest
-from ident_service.preflight.delay import CALM, FREQUENCY, Delay, delay_measures, dither
+from ident_service.preflight.delay import CALM, FREQUENCY, Delay, delay_measures, dither_amplitude
 from ident_service.preflight.session import BAND, CREEP, Rows, Session, Trace, remedy_of
-from ident_service.preflight.stability import INERTIA, drive_matrix, known_drives
+from ident_service.preflight.stability import INERTIA, drive_matrix, known_drive_inertia
 from ident_service.preflight.static_checks import HOLDABLE
 
 AMPLITUDES = (0.04, -0.04, 0.02, -0.02)  # rad or m, the first that is free
@@ -113,8 +121,10 @@ class JointResponse:
     doubt: float
 
 
-def strokes(session: Session, model: ArmModel, limits: MotionLimits, only: int | None = None) -> list[TestMotion]:
-    """Plan a small test motion there and back for each joint, or that of index `only`; MotionRefused without room.
+def plan_strokes(
+    session: Session, model: ArmModel, limits: MotionLimits, only_joint: int | None = None
+) -> list[TestMotion]:
+    """Plan a small test motion there and back for each joint, or for index `only_joint`; MotionRefused without room.
 
     Raises:
         MotionRefused: a joint has no room within its position limits or its surroundings.
@@ -132,7 +142,7 @@ def strokes(session: Session, model: ArmModel, limits: MotionLimits, only: int |
     )
     found = []
     for joint, name in enumerate(model.chain.names):
-        if only not in (None, joint):
+        if only_joint not in (None, joint):
             continue
         if (free := _clear_test_motion(session.home, joint, collision, slow, model.config.workspace.clearance)) is None:
             raise MotionRefused(f"{name}: no room to move by at least {min(np.abs(AMPLITUDES)):g} either way")
@@ -152,7 +162,7 @@ def follow_stroke(session: Session, stroke: TestMotion) -> tuple[Rows, Rows]:
     reference: Reference = stroke
     first, second = LEARNING
     session.follow(reference, stroke.duration, first)
-    amplitude = dither(session, session.torque_limit, stroke.joint)
+    amplitude = dither_amplitude(session, session.torque_limit, stroke.joint)
     shaken = session.follow(reference, stroke.duration, second, (amplitude, FREQUENCY))
     return session.follow(reference, stroke.duration), shaken
 
@@ -212,7 +222,7 @@ def moved_against_torque(trace: Trace, joint: int, session: Session) -> bool:
     return gain < 0.0
 
 
-def swings(trace: Trace, joint: int) -> bool:
+def swings_to_both_sides(trace: Trace, joint: int) -> bool:
     """Return whether a joint was far from its reference on both sides: an unstable loop swings, a wrong sign does not.
 
     A loop that is not stable swings, and by its delay seems to move against its torque.
@@ -269,29 +279,29 @@ def wrong_signs(trace: Trace, session: Session) -> list[int]:
     return sorted(found)
 
 
-def sign_failure(joints: Sequence[int], model: ArmModel, why: str) -> Check:
+def sign_failure(joints: Sequence[int], model: ArmModel, reason: str) -> Check:
     """Return the failed direction check of an arm with joints that went the wrong way."""
     names = ", ".join(model.chain.names[joint] for joint in joints)
-    return failed("direction", f"{names}: seems to move against its torque ({why})", SIGN_REMEDY)
+    return failed_check("direction", f"{names}: seems to move against its torque ({reason})", SIGN_REMEDY)
 
 
 def direction_check(
-    answers: Sequence[JointResponse], model: ArmModel, session: Session, delays: Sequence[Delay] = ()
+    responses: Sequence[JointResponse], model: ArmModel, session: Session, delays: Sequence[Delay] = ()
 ) -> Check:
     """Return the check `direction`: joints follow, answer torque as predicted, and hide no unknown delay."""
     names, ones = model.chain.names, ("",) * model.chain.joints
     nothing = np.zeros(len(names))
-    follows = np.array([one.follows for one in answers])
+    follows = np.array([one.follows for one in responses])
     # What the drives are known to have does not get lighter with the links: doubled torque shows the sooner.
     most = np.minimum(MOST_ANSWER, MORE_TORQUE * np.diag(session.inertia) / session.lightest)
     known = nothing if model.prior is None else np.diag(drive_matrix(model, model.prior))
-    said = known_drives(model)
+    said = known_drive_inertia(model)
     least = np.where(known > 0.0, LEAST_ANSWER, np.where(said > 0.0, LEAST_DESCRIBED, 0.0))
     identified = (known > 0.0) & (_dry_friction(model) > 0.0)
     least = np.where(identified, IDENTIFIED_ANSWER[0], least)
     most = np.where(identified, np.minimum(IDENTIFIED_ANSWER[1], most), most)
-    response = np.array([one.answers for one in answers])
-    doubt = np.array([one.doubt for one in answers])
+    response = np.array([one.answers for one in responses])
+    doubt = np.array([one.doubt for one in responses])
     # The doubt is on the arm's side: only an answer that is certainly out of bounds is.
     nearest = np.clip(response, least, most)
     judged_at = np.where(np.abs(response - nearest) <= _DOUBT * doubt, nearest, response)
@@ -390,9 +400,9 @@ def _clear_test_motion(
     return None
 
 
-def expected_displacement(trace: Trace, session: Session, sign: Vector | float = 1.0) -> Vector:
+def expected_displacement(trace: Trace, session: Session, torque_sign: Vector | float = 1.0) -> Vector:
     """Return the displacement that the model expects of torque minus gravity [rad or m], (cycles, joints)."""
-    acceleration = np.linalg.solve(session.inertia, (sign * (trace.torque - session.gravity)).T).T
+    acceleration = np.linalg.solve(session.inertia, (torque_sign * (trace.torque - session.gravity)).T).T
     return _integrated_twice(np.asarray(acceleration, dtype=np.float64), trace.period)
 
 
@@ -443,24 +453,24 @@ REMEDY = (
 )
 
 
-def holdable(gravity: Vector, model: ArmModel, limits: MotionLimits) -> Check | None:
+def too_heavy_check(gravity_torque: Vector, model: ArmModel, limits: MotionLimits) -> Check | None:
     """Return a failed check if the model's gravity torque takes too much of a torque limit; else None.
 
     Args:
-        gravity: the model's torque where the arm stands [N m or N], shape (joints,).
+        gravity_torque: the model's torque where the arm stands [N m or N], shape (joints,).
         model: of the arm.
         limits: of the arm.
     """
     found = measures(
         "gravity torque of the model",
-        np.abs(gravity),
+        np.abs(gravity_torque),
         joint_units(model.chain.revolute, "N m", "N"),
         model.chain.names,
         most=HOLDABLE * limits.torque,
     )
     if all(one.within_limits for one in found):
         return None
-    return failed(
+    return failed_check(
         "gravity",
         "holding the arm takes too much of the torque limits: "
         + "; ".join(str(one) for one in found if not one.within_limits),
@@ -479,41 +489,41 @@ def holding_torque(rows: Rows, period: float) -> Vector:
     return np.asarray(np.mean([sample.torque for sample, _ in rows[round(SETTLE / period) :]], axis=0))
 
 
-def differences(
-    held: Vector, gravity: Vector, limits: MotionLimits, friction: ExpectedFriction
+def gravity_differences(
+    held_torque: Vector, gravity_torque: Vector, limits: MotionLimits, friction: ExpectedFriction
 ) -> tuple[Vector, Vector]:
     """Return |held - gravity|, and the most that it may be by torque limit and friction [N m or N], (joints,) each."""
-    return np.abs(held - gravity), GRAVITY_ERROR * limits.torque + friction.coulomb
+    return np.abs(held_torque - gravity_torque), GRAVITY_ERROR * limits.torque + friction.coulomb
 
 
 def gravity_check(
-    held: Vector, gravity: Vector, model: ArmModel, limits: MotionLimits, friction: ExpectedFriction
+    held_torque: Vector, gravity_torque: Vector, model: ArmModel, limits: MotionLimits, friction: ExpectedFriction
 ) -> Check:
-    """Return the check `gravity`: failed where holding torque and model differ by more than `differences` allows.
+    """Return the check `gravity`: failed where the torque that held the arm differs too much from the model's.
 
     Args:
-        held: `holding_torque` [N m or N], shape (joints,).
-        gravity: the model's torque there, likewise.
+        held_torque: `holding_torque` [N m or N], shape (joints,).
+        gravity_torque: the model's torque there, likewise.
         model: of the arm.
         limits: of the arm.
         friction: Coulomb friction may hold the arm instead of torque, either way.
     """
     names = model.chain.names
     force = joint_units(model.chain.revolute, "N m", "N")
-    difference, most = differences(held, gravity, limits, friction)
+    difference, most = gravity_differences(held_torque, gravity_torque, limits, friction)
     found = [
-        *measures("holding torque", held, force, names),
-        *measures("gravity torque of the model", gravity, force, names),
+        *measures("holding torque", held_torque, force, names),
+        *measures("gravity torque of the model", gravity_torque, force, names),
         *measures("difference", difference, force, names, most=most),
     ]
     check = check_from_measures("gravity", found, REMEDY)
-    if check.verdict is Verdict.FAILED and (weight := _weight(held - gravity, gravity, most)):
+    if check.verdict is Verdict.FAILED and (weight := _weight(held_torque - gravity_torque, gravity_torque, most)):
         return replace(check, reason=f"{weight}: {check.reason}")
     return check
 
 
 def holding_fault_check(
-    session: Session, model: ArmModel, limits: MotionLimits, friction: ExpectedFriction, error: ArmFault
+    session: Session, model: ArmModel, limits: MotionLimits, friction: ExpectedFriction, fault: ArmFault
 ) -> Check:
     """Return the failed check on a fault that ended the holding: `direction` for a wrong sign, else `gravity`.
 
@@ -525,18 +535,18 @@ def holding_fault_check(
         model: of the arm.
         limits: of the arm.
         friction: expected friction.
-        error: the fault.
+        fault: the fault.
     """
-    remedy, trace = remedy_of(error), session.trace()
-    stands_still = error.code == "frozen_encoder"
+    remedy, trace = remedy_of(fault), session.trace()
+    stands_still = fault.code == "frozen_encoder"
     if remedy is not None and not stands_still:
-        return failed("gravity", str(error), remedy)
+        return failed_check("gravity", str(fault), remedy)
     if not stands_still and (wrong := wrong_signs(trace, session)):
-        return sign_failure(wrong, model, str(error))
+        return sign_failure(wrong, model, str(fault))
     moved = trace.position[-1] - trace.position[0]
     sunk = (moved * session.gravity < 0.0) & (np.abs(moved) > _SUNK)
     extra = np.where(sunk, trace.torque[-1] - session.gravity, 0.0)
-    _, most = differences(trace.torque[-1], session.gravity, limits, friction)
+    _, most = gravity_differences(trace.torque[-1], session.gravity, limits, friction)
     if weight := _weight(extra, session.gravity, most):
         joints = ", ".join(
             f"{name} sank by {abs(way):.3g} {unit} against {abs(more):.3g} {force} more than the model's"
@@ -551,10 +561,10 @@ def holding_fault_check(
             )
             if abs(more) > most_more
         )
-        return failed("gravity", f"{weight}: {joints}; the safety monitor released it ({error.code})", REMEDY)
+        return failed_check("gravity", f"{weight}: {joints}; the safety monitor released it ({fault.code})", REMEDY)
     if remedy is not None:
-        return failed("gravity", str(error), remedy)
-    return failed("gravity", f"the arm could not be held where it stands: {error}", f"{REMEDY} {_SIGNS}")
+        return failed_check("gravity", str(fault), remedy)
+    return failed_check("gravity", f"the arm could not be held where it stands: {fault}", f"{REMEDY} {_SIGNS}")
 
 
 def _weight(extra: Vector, gravity: Vector, most: Vector) -> str:

@@ -43,7 +43,7 @@ class Delay:
     deviation: float
 
 
-def dither(session: Session, torque_limit: Vector, joint: int) -> Vector:
+def dither_amplitude(session: Session, torque_limit: Vector, joint: int) -> Vector:
     """Return the amplitude of a sinusoidal test torque on one joint [N m or N], (joints,); zero in too slow a loop."""
     if FREQUENCY * session.period > 1.0 / _LEAST_SAMPLES:
         return np.zeros(len(torque_limit))
@@ -53,7 +53,7 @@ def dither(session: Session, torque_limit: Vector, joint: int) -> Vector:
     return np.where(np.arange(len(torque_limit)) == joint, size, 0.0)
 
 
-def hidden_delay(trace: Trace, expected: Vector, joint: int) -> Delay | None:
+def hidden_delay(trace: Trace, expected_path: Vector, joint: int) -> Delay | None:
     """Return a joint's hidden delay and its deviation [s]; None where it did not slide long enough, or respond.
 
     With a the measured and b the expected acceleration, both through one filter, `a(t) = g b(t - d) + friction`, and so
@@ -61,7 +61,7 @@ def hidden_delay(trace: Trace, expected: Vector, joint: int) -> Delay | None:
 
     Args:
         trace: trace of a test motion with the sinusoidal torque; nothing is measured in a loop too slow for it.
-        expected: positions that the model expects of the torque that acted [rad or m], shape (cycles, joints).
+        expected_path: positions that the model expects of the torque that acted [rad or m], shape (cycles, joints).
         joint: index of the joint that was moved.
     """
     period, rate = trace.period, trace.rate[:, joint]
@@ -77,7 +77,7 @@ def hidden_delay(trace: Trace, expected: Vector, joint: int) -> Delay | None:
         return None
     time, seconds, deviation = np.arange(len(rate)) * period, 0.0, 0.0
     for _ in range(_STEPS):  # of Gauss and Newton: each is of first order in what is left of the delay
-        way = np.interp(time - seconds, time, expected[:, joint])
+        way = np.interp(time - seconds, time, expected_path[:, joint])
         asked = local_polynomial(way, window, 2, 2, period)
         friction = [np.sign(rate), speed, np.ones_like(speed)]
         columns = np.column_stack([asked, np.gradient(asked, period), *friction])[sliding]

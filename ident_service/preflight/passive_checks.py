@@ -15,20 +15,20 @@ from drivers.axis_status import AxisStatus
 from ident_service.config.motion_limits import MotionLimits
 from ident_service.errors import AnotherDrive, ArmError, PositionUnknown, UnsuitableDrive
 from ident_service.model.arm_model import ArmModel
-from ident_service.motion.last_position import LOOK_AT_IT, LastPosition, turned
+from ident_service.motion.last_position import LOOK_AT_IT, LastPosition, whole_turns_text
 from ident_service.motion.ticket import (
     Check,
     Verdict,
     check_from_measures,
-    failed,
+    failed_check,
     joint_units,
     measure,
     measures,
-    skipped,
+    skipped_check,
 )
 from ident_service.preflight.session import ANSWERS_REMEDY, RATE_REMEDY, UNREACHABLE_REMEDY
 from ident_service.preflight.stability import delay_of
-from ident_service.preflight.static_checks import LONG_SILENCE_REMEDY, long_silence
+from ident_service.preflight.static_checks import LONG_SILENCE_REMEDY, long_silence_text
 
 DRIFT = 0.05  # of the velocity limit, as at the beginning of a run
 LATE = 0.25  # of a period: a later cycle counts as late (FIELDBUS.md 5.2, after OWD)
@@ -76,7 +76,7 @@ class IdleRecording:
 
 
 def record_idle(
-    arm: Arm, cycles: int, period: float, work: Callable[[Sample], None] = lambda sample: None
+    arm: Arm, cycles: int, period: float, on_sample: Callable[[Sample], None] = lambda sample: None
 ) -> IdleRecording:
     """Exchange cycles with an open arm without torque; return their samples and the times of waking.
 
@@ -84,7 +84,7 @@ def record_idle(
         arm: open.
         cycles: number of cycles.
         period: of its description [s].
-        work: function that is called in every cycle, so that the rate is measured under the load of a run.
+        on_sample: function that is called in every cycle, so that the rate is measured under the load of a run.
 
     Raises:
         DriverError: the arm does not answer at all.
@@ -94,7 +94,7 @@ def record_idle(
         sample = arm.exchange(None)
         woken.append(arm.clock.now_ns())
         samples.append(sample)
-        work(sample)
+        on_sample(sample)
     return IdleRecording(tuple(samples), np.array(woken, dtype=float), period)
 
 
@@ -102,7 +102,7 @@ def identities_check(
     described: ArmDescription,
     model: ArmModel,
     limits: MotionLimits,
-    looked: IdleRecording,
+    idle: IdleRecording,
     setup: Sequence[SetupCheck] = (),
 ) -> Check:
     """Return the check `identities`: joints, drives, answers, torque limits and rate as described, no drive faulted.
@@ -112,22 +112,22 @@ def identities_check(
         model: of the arm.
         limits: limits of the description; the driver must not clip below them, or what was proven of torques is not
             true.
-        looked: idle recording of the arm.
+        idle: idle recording of the arm.
         setup: reports of the drives on their set-up.
     """
     code, names = "identities", model.chain.names
     if described.joint_names != names:
-        return failed(
+        return failed_check(
             code,
             f"the drives have the joints {', '.join(described.joint_names)}, the description {', '.join(names)}",
             "Give the description of this arm, or connect the arm that the description means.",
         )
     if wrong := [one for one in setup if not one.good]:
         remedies = dict.fromkeys(one.remedy for one in wrong if one.remedy)
-        return failed(code, "; ".join(map(str, wrong)), " ".join(remedies))
-    if too_long := long_silence(model, limits, described.watchdog):
-        return failed(code, too_long, LONG_SILENCE_REMEDY)
-    last = looked.samples[-1]
+        return failed_check(code, "; ".join(map(str, wrong)), " ".join(remedies))
+    if too_long := long_silence_text(model, limits, described.watchdog):
+        return failed_check(code, too_long, LONG_SILENCE_REMEDY)
+    last = idle.samples[-1]
     stopped: dict[str, list[str]] = {}  # axes, by what their drives tell
     for name, state in zip(names, last.status, strict=False):
         if flags := AxisStatus(state) & (AxisStatus.FAULT | AxisStatus.EMERGENCY_STOP):
@@ -136,8 +136,8 @@ def identities_check(
     if stopped:
         todo = [remedy for flag, remedy in STOPPED.items() if any(AxisStatus(word) & flag for word in last.status)]
         reason = "; ".join(f"{', '.join(axes)}: {told}" for told, axes in stopped.items())
-        return failed(code, reason, " ".join(todo))
-    answers = np.array([sample.valid & np.isfinite(sample.position) for sample in looked.samples])
+        return failed_check(code, reason, " ".join(todo))
+    answers = np.array([sample.valid & np.isfinite(sample.position) for sample in idle.samples])
     nothing = np.zeros(len(names))
     found = [
         *measures("answers missing", 1.0 - answers.mean(axis=0), ("",) * len(names), names, most=nothing + LOST),
@@ -168,48 +168,50 @@ def identities_check(
 
 
 def at_rest_check(
-    looked: IdleRecording, model: ArmModel, limits: MotionLimits, closed: LastPosition | None = None
+    idle: IdleRecording, model: ArmModel, limits: MotionLimits, last_position: LastPosition | None = None
 ) -> Check:
     """Return the check `at_rest`: no drift without torque, inside position limits, no motor moved by whole turns.
 
     Args:
-        looked: idle recording of the arm.
+        idle: idle recording of the arm.
         model: of the arm.
         limits: of the arm.
-        closed: last position before the arm was closed, where that is known.
+        last_position: last position before the arm was closed, where that is known.
     """
     code, names = "at_rest", model.chain.names
-    if not looked.usable:
-        return failed(code, "not every axis answers as it should", "Check bus and encoders of the axes named above.")
-    position = looked.position
-    drift = np.abs(position[-1] - position[0]) / (looked.period * (len(position) - 1))
+    if not idle.usable:
+        return failed_check(
+            code, "not every axis answers as it should", "Check bus and encoders of the axes named above."
+        )
+    position = idle.position
+    drift = np.abs(position[-1] - position[0]) / (idle.period * (len(position) - 1))
     speed = joint_units(model.chain.revolute, "rad/s", "m/s")
     angle = joint_units(model.chain.revolute, "rad", "m")
     found = [
         *measures("drift", drift, speed, names, most=DRIFT * limits.velocity),
         *measures("position", position[-1], angle, names, least=limits.lower, most=limits.upper),
     ]
-    if closed is not None:
-        found += measures("moved since it was closed last", position[-1] - closed.position, angle, names)
-        if words := turned(closed, position[-1], model.config):
-            return failed(code, words, LOOK_AT_IT, found)
+    if last_position is not None:
+        found += measures("moved since it was closed last", position[-1] - last_position.position, angle, names)
+        if words := whole_turns_text(last_position, position[-1], model.config):
+            return failed_check(code, words, LOOK_AT_IT, found)
     return check_from_measures(
         code, found, "Let the arm come to rest on its support, inside its position limits, and keep hands off."
     )
 
 
-def rate_check(looked: IdleRecording, lock_step: bool) -> Check:
+def rate_check(idle: IdleRecording, lock_step: bool) -> Check:
     """Return the check `rate`: median period, worst lateness and share of late cycles; skipped in virtual time.
 
     Args:
-        looked: cycles of the arm, with the work of a run in each.
+        idle: cycles of the arm, with the work of a run in each.
         lock_step: whether time is virtual.
     """
     code = "rate"
     if lock_step:
-        return skipped(code, "time is virtual, so there is no lateness to measure")
-    period = looked.period
-    gaps = np.diff(looked.woken_ns) * 1e-9
+        return skipped_check(code, "time is virtual, so there is no lateness to measure")
+    period = idle.period
+    gaps = np.diff(idle.woken_ns) * 1e-9
     late = np.maximum(gaps - period, 0.0)
     found = [
         measure("median period", float(np.median(gaps)) * 1e3, "ms",
@@ -225,45 +227,45 @@ def rate_check(looked: IdleRecording, lock_step: bool) -> Check:
     )
 
 
-def loop_rate_check(stamps_ns: Vector, period: float, lock_step: bool, before: Check) -> Check:
-    """Return the check `rate` with the lateness under torque added; `before` itself if not passed, or in virtual time.
+def loop_rate_check(stamps_ns: Vector, period: float, lock_step: bool, idle_check: Check) -> Check:
+    """Return the check `rate` with the lateness under torque added; `idle_check` if that failed or time is virtual.
 
     Args:
         stamps_ns: of the cycles [ns], shape (cycles,).
         period: [s].
         lock_step: whether time is virtual.
-        before: the check of the rate without torque.
+        idle_check: the check of the rate without torque.
     """
-    if lock_step or before.verdict is not Verdict.PASSED:
-        return before
+    if lock_step or idle_check.verdict is not Verdict.PASSED:
+        return idle_check
     gaps = np.diff(stamps_ns) * 1e-9
     late = np.maximum(gaps - period, 0.0)
     seconds = f"with torque frames for {float(gaps.sum()):.0f} s"
     found = [
-        *before.measures,
+        *idle_check.measures,
         measure(f"lateness of 99.9 % of the cycles, {seconds}", float(np.quantile(late, 0.999)) * 1e3, "ms"),
         measure(f"worst lateness, {seconds}", float(late.max()) * 1e3, "ms", most=LONGEST_GAP * period * 1e3),
         measure(f"late cycles, {seconds}", float((late > LATE * period).mean()), "", most=LATE_SHARE),
     ]
-    return check_from_measures(before.code, found, RATE_REMEDY)
+    return check_from_measures(idle_check.code, found, RATE_REMEDY)
 
 
 def noise_check(
-    looked: IdleRecording, described: ArmDescription, model: ArmModel, limits: MotionLimits, mass: Vector
+    idle: IdleRecording, described: ArmDescription, model: ArmModel, limits: MotionLimits, mass_matrix: Vector
 ) -> Check:
     """Return the check `noise`: position noise at rest, and the velocity and torque that filter and gains make of it.
 
     Args:
-        looked: idle recording of the arm at rest.
+        idle: idle recording of the arm at rest.
         described: description by the open arm, with the encoders' steps.
         model: model with the section `control` of the description.
         limits: limits with the gains.
-        mass: the model's mass matrix where the arm stands, shape (joints, joints).
+        mass_matrix: the model's mass matrix where the arm stands, shape (joints, joints).
     """
-    if not looked.usable:
-        return failed("noise", "not every axis answers as it should", "Check bus and encoders.")
-    names, period = model.chain.names, looked.period
-    position = looked.position
+    if not idle.usable:
+        return failed_check("noise", "not every axis answers as it should", "Check bus and encoders.")
+    names, period = model.chain.names, idle.period
+    position = idle.position
     time = np.linspace(-1.0, 1.0, len(position))[:, None]
     slope = (time * position).sum(axis=0) / (time**2).sum()
     noise = position - position.mean(axis=0) - slope * time
@@ -271,7 +273,7 @@ def noise_check(
     velocity = np.zeros_like(noise)
     for k in range(1, len(noise)):
         velocity[k] = velocity[k - 1] + gain * ((noise[k] - noise[k - 1]) / period - velocity[k - 1])
-    torque = (limits.kp * noise + limits.kd * velocity) @ mass.T
+    torque = (limits.kp * noise + limits.kd * velocity) @ mass_matrix.T
     angle = joint_units(model.chain.revolute, "rad", "m")
     speed = joint_units(model.chain.revolute, "rad/s", "m/s")
     force = joint_units(model.chain.revolute, "N m", "N")
@@ -299,7 +301,7 @@ def noise_check(
     )
 
 
-def unreachable(error: ArmError) -> Check:
+def unreachable_check(error: ArmError) -> Check:
     """Return the failed check `identities` of an arm that could not be opened or recorded, with the reason."""
     remedy = UNREACHABLE_REMEDY
     if isinstance(error, PositionUnknown):

@@ -35,9 +35,9 @@ from ident_service.motion.ticket import (
     Check,
     Ticket,
     Verdict,
-    failed,
+    failed_check,
     new_ticket,
-    skipped,
+    skipped_check,
     subject_of,
 )
 from ident_service.motion.trajectory import hold, rest
@@ -46,19 +46,19 @@ from ident_service.preflight.active_checks import (
     HOLD,
     SETTLE,
     TestMotion,
-    differences,
     direction_check,
     expected_displacement,
     follow_stroke,
     gravity_check,
-    holdable,
+    gravity_differences,
     holding_fault_check,
     holding_torque,
     judge_response,
     moved_against_torque,
+    plan_strokes,
     sign_failure,
-    strokes,
-    swings,
+    swings_to_both_sides,
+    too_heavy_check,
 )
 from ident_service.preflight.delay import hidden_delay
 from ident_service.preflight.passive_checks import (
@@ -69,7 +69,7 @@ from ident_service.preflight.passive_checks import (
     noise_check,
     rate_check,
     record_idle,
-    unreachable,
+    unreachable_check,
 )
 from ident_service.preflight.session import (
     BROKEN_REMEDY,
@@ -113,12 +113,12 @@ def preflight(
     *,
     confirm: Confirm = lambda question: "",
     clock: Clock | None = None,
-    tell: Tell = lambda check: None,
-    valid: timedelta = VALID,
-    look_seconds: float = LOOK,
-    rate_seconds: float = 0.0,
-    closed: LastPosition | None = None,
-    announce: Callable[[str], None] = lambda action: None,
+    on_check: Tell = lambda check: None,
+    validity: timedelta = VALID,
+    idle_seconds: float = LOOK,
+    holding_seconds: float = 0.0,
+    last_position: LastPosition | None = None,
+    tell_operator: Callable[[str], None] = lambda action: None,
 ) -> Ticket:
     """Open an arm, energise it and move each joint a little, to check it and a motion; return the ticket, good or bad.
 
@@ -130,21 +130,23 @@ def preflight(
         confirm: function that shows a question and returns what a person typed; called once, before anything is
             energised. Without the arm's name nothing is.
         clock: clock whose UTC stamps the ticket; by default the machine's. The loop has the arm's own.
-        tell: called with every check as soon as it is made.
-        valid: how long the ticket counts.
-        look_seconds: how long rate and noise are measured.
-        rate_seconds: how long the rate is measured with the torque that holds the arm, at least for `HOLD`.
-        closed: last position before the arm was closed, where that is known.
-        announce: called with what a person has to do before the arm can be enabled, and is waited for.
+        on_check: called with every check as soon as it is made.
+        validity: how long the ticket counts.
+        idle_seconds: how long rate and noise are measured.
+        holding_seconds: how long the rate is measured with the torque that holds the arm, at least for `HOLD`.
+        last_position: last position before the arm was closed, where that is known.
+        tell_operator: called with what a person has to do before the arm can be enabled, and is waited for.
 
     Returns:
         The ticket, whatever its verdict; what fails is in its checks, and nothing the arm does is raised.
     """
     clock = RealClock() if clock is None else clock
-    flight = _Preflight(arm, model, excitation, confirm, tell, look_seconds, rate_seconds, closed, announce)
+    flight = _Preflight(
+        arm, model, excitation, confirm, on_check, idle_seconds, holding_seconds, last_position, tell_operator
+    )
     flight.run()
     subject = subject_of(model, excitation, flight.described)
-    return new_ticket(subject, flight.all_checks(), clock.now_ns() + clock.utc_offset_ns, valid)
+    return new_ticket(subject, flight.all_checks(), clock.now_ns() + clock.utc_offset_ns, validity)
 
 
 def _felt_friction(model: ArmModel, limits: MotionLimits) -> ExpectedFriction:
@@ -160,7 +162,7 @@ class _Gravity:
 
     def carried_by(self, held: Vector) -> bool:
         """Return whether the torque that holds the arm is near enough to the model's; fast enough between cycles."""
-        difference, most = differences(held, self.torque, self.limits, self.friction)
+        difference, most = gravity_differences(held, self.torque, self.limits, self.friction)
         return bool((difference <= most).all())
 
 
@@ -227,8 +229,8 @@ class _Preflight:
         why = why if because is None else f"because {because} failed"
         made = dict(self.checks)
         if self.excitation is None:
-            made |= {code: skipped(code, "no motion was given") for code in ("motion_fits", "motion_proven")}
-        return [made.get(code) or skipped(code, why) for code in CODES]
+            made |= {code: skipped_check(code, "no motion was given") for code in ("motion_fits", "motion_proven")}
+        return [made.get(code) or skipped_check(code, why) for code in CODES]
 
     def _opened(self, limits: MotionLimits) -> None:
         self.described = self.arm.describe()
@@ -280,7 +282,7 @@ class _Preflight:
         self._passed(noise_check(looked, self.described, self.model, limits, session.mass))
         if any(c.verdict is Verdict.FAILED and c.code not in ABOUT_THE_MOTION for c in self.checks.values()):
             return False
-        if (impossible := holdable(session.gravity, self.model, limits)) is not None:
+        if (impossible := too_heavy_check(session.gravity, self.model, limits)) is not None:
             self._passed(impossible, of_place=True)
             return False
         refused = consent_check(self.model, looked.samples[-1], self.confirm)
@@ -291,10 +293,10 @@ class _Preflight:
         try:
             # Of a joint that stands outside its limits none leads farther out.
             room = relaxed_limits(session.home, motion_limits(self.model.config), 0.0)
-            return strokes(session, self.model, room)
+            return plan_strokes(session, self.model, room)
         except (ModelError, MotionRefused) as error:
             remedy = "Move the arm by hand to where every joint has room."
-            self._passed(failed("direction", str(error), remedy), of_place=True)
+            self._passed(failed_check("direction", str(error), remedy), of_place=True)
             return []
 
     def _touched(self, session: Session, planned: Sequence[TestMotion], gravity: _Gravity) -> None:
@@ -343,7 +345,7 @@ class _Preflight:
                 if at_rest_check(looked, self.model, recoverable_limits(limits)).verdict is Verdict.PASSED:
                     break
             else:
-                return failed(CODE, "the arm does not come to rest after its drives stopped", REST_REMEDY)
+                return failed_check(CODE, "the arm does not come to rest after its drives stopped", REST_REMEDY)
             home = looked.samples[-1].position
             if any(AxisStatus(word) & AxisStatus.FAULT for word in looked.samples[-1].status):
                 self.arm.reset()  # the host's own silence was the fault
@@ -352,7 +354,7 @@ class _Preflight:
                 friction = _felt_friction(self.model, limits)
                 session = Session(self.arm, self.model, limits, described, home, friction)
                 room = relaxed_limits(home, motion_limits(self.model.config), 0.0)
-                stroke = strokes(session, self.model, room, only=0)[0]
+                stroke = plan_strokes(session, self.model, room, only_joint=0)[0]
             self._energise(session)
             session.follow(hold(home), SETTLE)
             half = DWELL + 0.5 * stroke.there.duration
@@ -362,7 +364,7 @@ class _Preflight:
                 self._end_own_fault()
         except (MotionRefused, ArmFault) as error:
             self.arm.stop(StopKind.TORQUE_OFF)
-            return failed(CODE, f"in motion: {error}", REST_REMEDY, at_rest.measures)
+            return failed_check(CODE, f"in motion: {error}", REST_REMEDY, at_rest.measures)
         return replace(moving, measures=(*at_rest.measures, *moving.measures))
 
     def _end_own_fault(self) -> None:
@@ -424,33 +426,33 @@ class _Preflight:
             self._passed(holding_fault_check(session, self.model, gravity.limits, gravity.friction, error))
             return
         if (remedy := remedy_of(error)) is not None:
-            self._passed(failed("direction", str(error), remedy))
+            self._passed(failed_check("direction", str(error), remedy))
             return
         trace = session.trace()
         astray = int(np.argmax(np.abs(trace.position[-1] - trace.reference[-1])))
         name = self.model.chain.names[astray]
-        warned, swinging = code_of(error) in TORQUE_WARNINGS, swings(trace, astray)
+        warned, swinging = code_of(error) in TORQUE_WARNINGS, swings_to_both_sides(trace, astray)
         # A joint that is shaken stays about where it should be; one whose sign is wrong is on its way to the guard.
         left = not warned or abs(trace.position[-1] - trace.reference[-1])[astray] > 0.5 * FARTHEST
         if left and not swinging and moved_against_torque(trace, astray, session):
             self._passed(sign_failure([astray], self.model, str(error)))
         elif warned or swinging:
             reason = str(error) if warned else f"{name} swings about its path: {error}"
-            self._passed(failed("direction", reason, SHAKEN_REMEDY))
+            self._passed(failed_check("direction", reason, SHAKEN_REMEDY))
         else:
             remedy = f"Free {name} if something blocks it or a brake holds it; check its encoder and its signs."
-            self._passed(failed("direction", f"{name} left the path: {error}", remedy))
+            self._passed(failed_check("direction", f"{name} left the path: {error}", remedy))
 
     def _broken(self, error: ArmError) -> None:
         """Record a failed check for an arm that could not be opened, recorded or energised, or that fell silent."""
         if self.described is None or "identities" not in self.checks:
-            self._passed(unreachable(error))
+            self._passed(unreachable_check(error))
         else:
             # None about the motion: the path home may begin although one of them failed. The last where all are made.
             left = (code for code in CODES if code not in self.checks and code not in ABOUT_THE_MOTION)
             code = next(left, CODES[-1])
             remedy = "Do this, then check again." if isinstance(error, ActionNeeded) else BROKEN_REMEDY
-            self._passed(failed(code, str(error), remedy))
+            self._passed(failed_check(code, str(error), remedy))
 
     def _left_behind(self, words: str) -> None:
         """Record which drives have not confirmed that they are off, with what failed last of the arm's own checks.
@@ -463,7 +465,7 @@ class _Preflight:
             self._passed(replace(bad[-1], reason=f"{bad[-1].reason}; {words}"))
         else:
             last = self.checks.get(CODES[-1])
-            self._passed(failed(CODES[-1], words, CLOSING_REMEDY, () if last is None else last.measures))
+            self._passed(failed_check(CODES[-1], words, CLOSING_REMEDY, () if last is None else last.measures))
 
     def _passed(self, check: Check, *, of_place: bool = False) -> bool:
         if of_place and check.verdict is Verdict.FAILED and self.away:

@@ -35,7 +35,7 @@ from ident_service.motion.encoder_observer import encoder_coupling
 from ident_service.motion.run import MOVED
 from ident_service.motion.safety_monitor import Reaction, SafetyMonitor
 from ident_service.motion.trajectory import Reference, Setpoint
-from ident_service.preflight.stability import INERTIA, known_drives
+from ident_service.preflight.stability import INERTIA, known_drive_inertia
 
 _DRIVE = "Read the drive's own fault code and mend its cause; then `ident recover` tells what else is in the way."
 RATE_REMEDY = (
@@ -227,7 +227,7 @@ class Session:
         self._dynamics = dynamics
         self.gravity = dynamics.torque(home, still, still)
         self.mass = dynamics.mass_matrix(home)
-        self.inertia = self.mass + np.diag(known_drives(control_model(model)))
+        self.inertia = self.mass + np.diag(known_drive_inertia(control_model(model)))
         prior = np.zeros(model.layout.size) if model.prior is None else model.prior
         links = InverseDynamics(model.chain, model.layout, prior).mass_matrix(home)
         self.lightest = np.diag(self.inertia - (1.0 - INERTIA[0]) * links)
@@ -286,18 +286,22 @@ class Session:
                 raise ArmFault(MOVED_CODE, "the arm was moved while a person was waited for; check again", [sample])
 
     def follow(
-        self, reference: Reference, seconds: float, learning: float = 0.0, shaking: tuple[Vector, float] | None = None
+        self,
+        reference: Reference,
+        seconds: float,
+        friction_learning_rate: float = 0.0,
+        shaking_torque: tuple[Vector, float] | None = None,
     ) -> Rows:
-        """Control the arm along a reference for some seconds, safety checks on; return each cycle's sample and target.
+        """Control the arm along a reference for some seconds, safety checks on; return cycles' samples and references.
 
         Args:
             reference: trajectory from the present setpoint on.
             seconds: duration [s].
-            learning: how fast the torque that dry friction takes is learned from the lag of moving joints, as a share
-                of `kp M` times that lag per second [1/s]. Without, small motions get lost in friction: what moves a
-                WAM's first joint takes 13 mrad of error.
-            shaking: amplitude [N m or N], shape (joints,), and frequency [Hz] of a sinusoidal torque on top; of drives
-                that are given positions none can be.
+            friction_learning_rate: how fast the torque that dry friction takes is learned from the lag of moving
+                joints, as a share of `kp M` times that lag per second [1/s]. Without, small motions get lost in
+                friction: what moves a WAM's first joint takes 13 mrad of error.
+            shaking_torque: amplitude [N m or N], shape (joints,), and frequency [Hz] of a sinusoidal torque on top; of
+                drives that are given positions none can be.
 
         Returns:
             The cycles with their references, for `trace_of`.
@@ -318,15 +322,15 @@ class Session:
             self._rows.append((sample, setpoint))
             self._words = sample.status
             wanted = self._safe_torque(sample, setpoint, np.zeros(len(self.home), dtype=bool))
-            if shaking is not None:
+            if shaking_torque is not None:
                 # On its way only: a joint that sticks would look like one whose encoder does.
                 moving = np.clip(np.abs(setpoint.velocity) / (2.0 * CREEP), 0.0, 1.0)
-                wanted = wanted + moving * shaking[0] * np.sin(2.0 * np.pi * shaking[1] * elapsed)
+                wanted = wanted + moving * shaking_torque[0] * np.sin(2.0 * np.pi * shaking_torque[1] * elapsed)
             if self.gives_positions:
                 self._target = self._passed(setpoint.position)
             else:
-                self._target = self._limited(wanted + self._learned_friction(setpoint, learning))
-            if learning and not self.gives_positions and setpoint.velocity.any():
+                self._target = self._limited(wanted + self._learned_friction(setpoint, friction_learning_rate))
+            if friction_learning_rate and not self.gives_positions and setpoint.velocity.any():
                 learned.setdefault(bool(setpoint.velocity.sum() > 0.0), []).append(self._friction)
             if elapsed >= seconds:
                 if learned:
@@ -351,7 +355,7 @@ class Session:
             return self._arm.exchange(None)
         return (self._arm.exchange_position if self.gives_positions else self._arm.exchange)(self._target)
 
-    def cycle_without_signal(self, sample: Sample, setpoint: Setpoint, given_up: Flags, *, sends: bool) -> None:
+    def check_without_signal(self, sample: Sample, setpoint: Setpoint, given_up: Flags, *, sends: bool) -> None:
         """Check a cycle in which a signal is withheld from drives on purpose, and compute the next target.
 
         What drives report of themselves is what is being tried, and is not judged here; neither are joints whose drives
@@ -389,7 +393,7 @@ class Session:
         if sends:
             self._target = self._passed(asked.position) if self.gives_positions else self._limited(wanted)
 
-    def repeat_last_torque(self) -> None:
+    def keep_last_target(self) -> None:
         """Keep the last target for the next cycle, after the safety checks, while drives report no positions.
 
         Raises:
@@ -398,7 +402,7 @@ class Session:
         self._target = self._passed(self._target) if self.gives_positions else self._limited(self._target)
 
     def trace(self) -> Trace:
-        """Return the cycles of the last `follow` as a trace, also of one that a fault ended."""
+        """Return the cycles of the last `follow` as arrays with even time steps, also if a fault ended it."""
         return trace_of(self._rows, self.period)
 
     def release(self) -> None:
@@ -418,14 +422,14 @@ class Session:
         velocity, correction = (np.where(given_up, 0.0, of) for of in (control.velocity, self._correction))
         known = self._since.known
         pushes = sample.torque - self._explained if self._explained is not None else np.zeros_like(velocity)
-        usable, fault = self._guard.feedback(
+        usable, fault = self._guard.check_feedback(
             sample,
             setpoint,
             velocity,
             correction,
             elapsed=since,
-            known=known,
-            unexplained=np.where(given_up, 0.0, pushes),
+            elapsed_is_exact=known,
+            unexplained_torque=np.where(given_up, 0.0, pushes),
         )
         if fault is not None and fault.reaction is not Reaction.WARN:
             raise ArmFault(fault.code, fault.message, [row[0] for row in self._rows[-100:]])
@@ -449,7 +453,7 @@ class Session:
 
     def _passed(self, wanted: Vector) -> Vector:
         """Return the position that the guard lets pass [rad or m], shape (joints,)."""
-        position, fault = self._guard.position(wanted)
+        position, fault = self._guard.limit_position(wanted)
         if fault is not None and fault.reaction is not Reaction.WARN:
             raise ArmFault(fault.code, fault.message, [row[0] for row in self._rows[-100:]])
         return position
@@ -457,7 +461,7 @@ class Session:
     def _limited(self, wanted: Vector, *, band: bool = True) -> Vector:
         if band:
             wanted = np.clip(wanted, self.gravity - self._band, self.gravity + self._band)
-        torque, fault = self._guard.torque(wanted)
+        torque, fault = self._guard.limit_torque(wanted)
         if fault is not None and fault.reaction is not Reaction.WARN:
             raise ArmFault(fault.code, fault.message, [row[0] for row in self._rows[-100:]])
         return torque

@@ -172,12 +172,12 @@ def stability(
     return StabilityReport(loop.period, delay_cycles, joints, coupled)
 
 
-def transition(loop: Loop, ratio: Vector) -> Vector:
+def transition_matrix(loop: Loop, inertia_ratio: Vector) -> Vector:
     """Return the matrix of the closed loop's linear recursion from cycle to cycle; its eigenvalues show stability.
 
     Args:
         loop: loop with gains, rate and delay.
-        ratio: `R = M_true^-1 M_model`, shape (..., joints, joints).
+        inertia_ratio: `R = M_true^-1 M_model`, shape (..., joints, joints).
 
     Returns:
         Shape (..., size, size), size = joints * (4 + queued torques).
@@ -192,14 +192,14 @@ def transition(loop: Loop, ratio: Vector) -> Vector:
         return slice(block * n, (block + 1) * n)
 
     q, dq, before, filtered = at(0), at(1), at(2), at(3)
-    A = np.zeros((*ratio.shape[:-2], (4 + queued) * n, (4 + queued) * n))
+    A = np.zeros((*inertia_ratio.shape[:-2], (4 + queued) * n, (4 + queued) * n))
     A[..., q, q] = A[..., dq, dq] = A[..., before, q] = eye
     A[..., q, dq] = h * eye
     older, newer = (at(4), at(5)) if late > 0.0 else (at(4), at(4))
-    A[..., q, older] += h * h * (late - 0.5 * late**2) * ratio
-    A[..., dq, older] += h * late * ratio
-    A[..., q, newer] += h * h * 0.5 * (1.0 - late) ** 2 * ratio
-    A[..., dq, newer] += h * (1.0 - late) * ratio
+    A[..., q, older] += h * h * (late - 0.5 * late**2) * inertia_ratio
+    A[..., dq, older] += h * late * inertia_ratio
+    A[..., q, newer] += h * h * 0.5 * (1.0 - late) ** 2 * inertia_ratio
+    A[..., dq, newer] += h * (1.0 - late) * inertia_ratio
     A[..., filtered, q] = np.diag(g / h)
     A[..., filtered, before] = -np.diag(g / h)
     A[..., filtered, filtered] = np.diag(1.0 - g)
@@ -212,9 +212,9 @@ def transition(loop: Loop, ratio: Vector) -> Vector:
     return A
 
 
-def spectral_radius(loop: Loop, ratio: Vector) -> Vector:
-    """Return the spectral radius of the loop's recursion, (...,), below 1 if stable; `ratio` as in `transition`."""
-    return np.asarray(np.abs(np.linalg.eigvals(transition(loop, ratio))).max(axis=-1))
+def spectral_radius(loop: Loop, inertia_ratio: Vector) -> Vector:
+    """Return the spectral radius of the loop's recursion, (...,), below 1 if stable, for `inertia_ratio`."""
+    return np.asarray(np.abs(np.linalg.eigvals(transition_matrix(loop, inertia_ratio))).max(axis=-1))
 
 
 def _single_joint_loop(loop: Loop, joint: int) -> Loop:
@@ -272,7 +272,7 @@ def drive_matrix(model: ArmModel, delta: Vector) -> Vector:
     return np.asarray(coupling.T @ (model.layout.term_values("drive_inertia", delta)[:, None] * coupling))
 
 
-def known_drives(model: ArmModel) -> Vector:
+def known_drive_inertia(model: ArmModel) -> Vector:
     """Return drive inertia that the description states beyond the prior's [kg m^2 or kg], (joints,); 0 if no prior."""
     joints = [model.config.joints.get(name) for name in model.chain.names]
     said = np.array([0.0 if joint is None else joint.drive_inertia or 0.0 for joint in joints])

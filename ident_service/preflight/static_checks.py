@@ -23,11 +23,11 @@ from ident_service.motion.ticket import (
     Measure,
     Verdict,
     check_from_measures,
-    failed,
+    failed_check,
     joint_units,
     measure,
     measures,
-    skipped,
+    skipped_check,
 )
 from ident_service.motion.trajectory import PathReference, Reference, plan_trajectory, rest
 from ident_service.preflight.stability import INERTIA, LEAST_GAIN_MARGIN, delay_of, stability
@@ -48,12 +48,12 @@ _POSTURES = 8  # of the motion, at which the coupled loop is judged
 
 
 @unhurried()
-def configuration_check(model: ArmModel, load: Budget | None = None) -> Check:
+def configuration_check(model: ArmModel, bus_budget: Budget | None = None) -> Check:
     """Return the check `configuration`: limits, gains, feasible prior, secured stop, short watchdogs, room on the bus.
 
     Args:
         model: of the arm.
-        load: load of the arm's buses; None for an arm on none.
+        bus_budget: load of the arm's buses; None for an arm on none.
     """
     code, remedy = "configuration", "Complete the arm's description; `ident config check` names every place."
     try:
@@ -64,21 +64,21 @@ def configuration_check(model: ArmModel, load: Budget | None = None) -> Check:
         after_stop(model, limits)
         smallest = float(np.linalg.eigvalsh(dynamics.mass_matrix(limits.home)).min())
     except IdentError as error:
-        return failed(code, str(error), remedy)
+        return failed_check(code, str(error), remedy)
     if not smallest > 0.0:
-        return failed(
+        return failed_check(
             code,
             "the prior's mass matrix at home is not positive definite: no real body has these parameters",
             "Give prior parameters of a feasible identification or of a CAD model.",
         )
-    if too_long := long_silence(model, limits, model.config.watchdog):
-        return failed(code, too_long, LONG_SILENCE_REMEDY)
-    if load is not None and not load.fits:
-        return failed(code, load.reason, load.remedy)
+    if too_long := long_silence_text(model, limits, model.config.watchdog):
+        return failed_check(code, too_long, LONG_SILENCE_REMEDY)
+    if bus_budget is not None and not bus_budget.fits:
+        return failed_check(code, bus_budget.reason, bus_budget.remedy)
     return Check(code, Verdict.PASSED)
 
 
-def long_silence(model: ArmModel, limits: MotionLimits, seconds: float | None) -> str:
+def long_silence_text(model: ArmModel, limits: MotionLimits, watchdog_seconds: float | None) -> str:
     """Return a sentence if drives act on too long without host and joints can fall; empty if not, or not known.
 
     It is empty, too, where the description says why that is safe (`watchdog_reason`).
@@ -86,14 +86,14 @@ def long_silence(model: ArmModel, limits: MotionLimits, seconds: float | None) -
     Args:
         model: model of the arm, with a prior.
         limits: of the arm.
-        seconds: time after which the drives give up torque [s]; None where unknown.
+        watchdog_seconds: time after which the drives give up torque [s]; None where unknown.
     """
-    if seconds is None or seconds <= LONGEST_SILENCE or model.config.watchdog_reason:
+    if watchdog_seconds is None or watchdog_seconds <= LONGEST_SILENCE or model.config.watchdog_reason:
         return ""
     if not (falling := joints_with_weight(model, limits)):
         return ""
     return (
-        f"drives go on for {seconds:g} s when the host is gone, and {', '.join(falling)} can fall: at most "
+        f"drives go on for {watchdog_seconds:g} s when the host is gone, and {', '.join(falling)} can fall: at most "
         f"{LONGEST_SILENCE:g} s"
     )
 
@@ -102,9 +102,11 @@ def motion_fits_check(model: ArmModel, excitation: Excitation) -> Check:
     """Return the check `motion_fits`: passed if the motion was made for this description (`motion_sha256`)."""
     code, remedy = "motion_fits", "Design the motion again for the description as it is now."
     if excitation.arm_sha256 != model.config.motion_sha256:
-        return failed(code, f"the {excitation.name} motion was made for another description of the arm", remedy)
+        return failed_check(code, f"the {excitation.name} motion was made for another description of the arm", remedy)
     if excitation.path.joints != model.chain.joints:
-        return failed(code, f"a motion of {excitation.path.joints} joints for an arm of {model.chain.joints}", remedy)
+        return failed_check(
+            code, f"a motion of {excitation.path.joints} joints for an arm of {model.chain.joints}", remedy
+        )
     return Check(code, Verdict.PASSED)
 
 
@@ -119,7 +121,7 @@ def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excit
         found = violations(proof, model, limits)
         nearest = motion_stop_clearance(excitation.path, limits, model)
     except (ModelError, MotionRefused) as error:
-        return failed(code, str(error), remedy)
+        return failed_check(code, str(error), remedy)
     try:
         require_stops_within_limits(excitation.path, limits, model.chain.names)
     except MotionRefused as error:
@@ -131,7 +133,7 @@ def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excit
             share = peak / getattr(limits, key)
             taken += measures(f"{key}, share of the limit", share, ("",) * len(names), names, most=np.ones(len(names)))
     seconds = np.linspace(0.0, excitation.path.duration, _SPEEDS)
-    taken += point_speeds(model, excitation.path.at(seconds)[0], seconds, "of the motion")
+    taken += point_speed_measures(model, excitation.path.at(seconds)[0], seconds, "of the motion")
     least = model.config.workspace.clearance
     for what, clearance in (("clearance", proof.clearance), ("clearance on the way from home", proof.approach)):
         if clearance is not None and clearance.pair is not None:
@@ -140,31 +142,31 @@ def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excit
         taken.append(measure("clearance of stops", nearest.distance, "m", least=0.0))
         if nearest.distance <= 0.0:
             found.append(f"a stop out of the motion at {nearest.time:.2f} s would touch: {nearest.pair}")
-    return failed(code, "; ".join(found), remedy, taken) if found else check_from_measures(code, taken, remedy)
+    return failed_check(code, "; ".join(found), remedy, taken) if found else check_from_measures(code, taken, remedy)
 
 
-def point_speeds(model: ArmModel, position: Vector, seconds: Vector, what: str) -> list[Measure]:
+def point_speed_measures(model: ArmModel, positions: Vector, sample_times: Vector, name_suffix: str) -> list[Measure]:
     """Return a list of one measure, the fastest frame's speed [m/s] with its limit; empty where none is described.
 
     Args:
         model: of the arm.
-        position: along a motion [rad or m], shape (samples, joints).
-        seconds: of the samples [s], shape (samples,).
-        what: suffix of the measure's name.
+        positions: along a motion [rad or m], shape (samples, joints).
+        sample_times: of the samples [s], shape (samples,).
+        name_suffix: suffix of the measure's name.
     """
     limit = model.config.point_speed_limit
     if limit is None:
         return []
-    steps = np.diff(frame_origins(model.chain, position), axis=0) / np.diff(seconds)[:, None, None]
+    steps = np.diff(frame_origins(model.chain, positions), axis=0) / np.diff(sample_times)[:, None, None]
     fastest = float(np.linalg.norm(steps, axis=2).max())
-    return [measure(f"speed of elbow and tip {what} (driver.limits.velocity)", fastest, "m/s", most=limit)]
+    return [measure(f"speed of elbow and tip {name_suffix} (driver.limits.velocity)", fastest, "m/s", most=limit)]
 
 
 def _leg_speeds(model: ArmModel, leg: Reference, what: str) -> list[Measure]:
     seconds = np.linspace(0.0, leg.duration, _LEG_SPEEDS)
     if model.config.point_speed_limit is None or not leg.duration > 0.0:
         return []
-    return point_speeds(model, np.array([leg.at(float(time)).position for time in seconds]), seconds, what)
+    return point_speed_measures(model, np.array([leg.at(float(time)).position for time in seconds]), seconds, what)
 
 
 @unhurried()
@@ -174,7 +176,7 @@ def stability_check(model: ArmModel, limits: MotionLimits, excitation: Excitatio
     Drives that are given positions close the loop by themselves, with gains of their maker's tool.
     """
     if getattr(model.config.driver, "streams", "torque") == "position":
-        return skipped("stability", "the drives close the position loop by themselves (driver.streams: position)")
+        return skipped_check("stability", "the drives close the position loop by themselves (driver.streams: position)")
     path = None if excitation is None or excitation.path.joints != model.chain.joints else excitation.path
     postures = np.vstack([limits.home, 0.5 * (limits.lower + limits.upper)])
     if path is not None:
@@ -218,12 +220,12 @@ def distance_from_home_text(model: ArmModel, limits: MotionLimits, position: Vec
 
 
 def path_home_check(model: ArmModel, limits: MotionLimits, position: Vector) -> Check:
-    """Return the check `ways_clear`: the straight way home is clear and slow enough, from `position` [rad or m]."""
+    """Return the check `ways_clear`: the straight way home is clear, and elbow and tip are slow enough on it."""
     code = "ways_clear"
     try:
         ((_, leg),) = PointToPointPlan(Destination.HOME).legs(model, position, limits)
     except (ModelError, MotionRefused) as error:
-        return failed(code, str(error), "Move the arm by hand to where the straight path home is free.")
+        return failed_check(code, str(error), "Move the arm by hand to where the straight path home is free.")
     found = [measure("the way home, length", leg.duration, "s"), *_leg_speeds(model, leg, "on the way home")]
     return check_from_measures(code, found, _SLOWER)
 
@@ -254,5 +256,7 @@ def paths_check(model: ArmModel, limits: MotionLimits, excitation: Excitation, p
                 clearance = trajectory_clearance(collision, leg, limits, least)
                 found.append(measure(f"{what}, clearance", clearance.lower_bound, "m", least=least))
     except (ModelError, MotionRefused) as error:
-        return failed(code, str(error), "Move the arm by hand to where motions begin (home), then check again.", found)
+        return failed_check(
+            code, str(error), "Move the arm by hand to where motions begin (home), then check again.", found
+        )
     return check_from_measures(code, found, "Move the arm by hand to where motions begin (home), then check again.")

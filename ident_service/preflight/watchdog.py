@@ -17,10 +17,10 @@ from drivers.axis_status import AxisStatus
 from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import ArmFault
 from ident_service.model.arm_model import ArmModel
-from ident_service.motion.ticket import Check, Verdict, check_from_measures, failed, measure
+from ident_service.motion.ticket import Check, Verdict, check_from_measures, failed_check, measure
 from ident_service.motion.trajectory import Setpoint
 from ident_service.preflight.session import REMEDIES, Session
-from ident_service.preflight.static_checks import LONGEST_SILENCE, long_silence
+from ident_service.preflight.static_checks import LONGEST_SILENCE, long_silence_text
 
 CODE = "watchdog"
 _STOPS = 0.5  # s that a slow joint is given to come to rest
@@ -57,7 +57,7 @@ def consent_check(model: ArmModel, sample: Sample, confirm: Confirm) -> Check | 
     if not sample.status:
         why = "the driver does not report drive states, so the watchdogs cannot be tested"
         remedy = "Nothing moves without this proof: have the driver report the state of each drive in `Sample.status`."
-        return failed(CODE, why, remedy)
+        return failed_check(CODE, why, remedy)
     name = model.config.name
     typed = confirm(
         "Now the arm gets torque: it is held where it stands, and every joint moves a little. At the end the drives' "
@@ -80,7 +80,11 @@ def watchdogs_of(arm: Arm, model: ArmModel) -> tuple[Watchdog, ...]:
 
 
 def watchdog_check(
-    arm: Arm, model: ArmModel, session: Session, setpoint_at: Callable[[float], Setpoint], moving: int | None = None
+    arm: Arm,
+    model: ArmModel,
+    session: Session,
+    setpoint_at: Callable[[float], Setpoint],
+    moving_joint: int | None = None,
 ) -> Check:
     """Withhold what each watchdog watches; return a check of whether the drives stop in time; the arm is off then.
 
@@ -93,7 +97,7 @@ def watchdog_check(
         model: model with the joints' names.
         session: the loop that holds the arm; without torque frames the last torque acts until a drive ends it.
         setpoint_at: function from the time since the silence began [s] to the setpoint of the joints that are held.
-        moving: number of the joint that moves, whose travel is measured; None at standstill.
+        moving_joint: number of the joint that moves, whose travel is measured; None at standstill.
 
     Raises:
         DriverError: the arm does not answer.
@@ -101,7 +105,7 @@ def watchdog_check(
     period = session.period
     dogs = watchdogs_of(arm, model)
     delay = arm.describe().report_delay
-    where = "at rest" if moving is None else "in motion"
+    where = "at rest" if moving_joint is None else "in motion"
     watchdog_expired: dict[int, tuple[float, AxisStatus]] = {}
     strange: list[str] = []
     begun = 0
@@ -122,7 +126,7 @@ def watchdog_check(
                     if not at.size:
                         begun, at = sample.stamp_ns, sample.position
                         if not all(word & AxisStatus.POWERED for word in status):
-                            return failed(CODE, "the drives do not report that they have power", REMEDY)
+                            return failed_check(CODE, "the drives do not report that they have power", REMEDY)
                 silent = (sample.stamp_ns - begin_ns) * 1e-9
                 for number, word in enumerate(status):
                     if word & AxisStatus.EMERGENCY_STOP:
@@ -137,24 +141,24 @@ def watchdog_check(
                 if strange:
                     break
                 if kind in _BLIND:
-                    session.repeat_last_torque()
+                    session.keep_last_target()
                 else:
                     setpoint = setpoint_at((sample.stamp_ns - begun) * 1e-9)
-                    session.cycle_without_signal(
+                    session.check_without_signal(
                         sample, setpoint, _joints_of(watchdog_expired, model), sends=not of_torque
                     )
                 if all(number in watchdog_expired for number in watched) or silent > most:
                     break
             if strange:
                 break
-        travel = _travel(arm, at, moving) if moving is not None else None
+        travel = _travel(arm, at, moving_joint) if moving_joint is not None else None
     except ArmFault as ended:
         why = f"{where}, while drives missed {_WORDS[kind]} and before all had said that they stopped: {ended}"
-        return failed(CODE, f"{why}; the arm was released", REMEDY)
+        return failed_check(CODE, f"{why}; the arm was released", REMEDY)
     finally:
         arm.stop(StopKind.TORQUE_OFF)
     found = []
-    falls = bool(long_silence(model, motion_limits(model.config), math.inf))
+    falls = bool(long_silence_text(model, motion_limits(model.config), math.inf))
     for number, dog in enumerate(dogs):
         seconds, word = watchdog_expired.get(number, (None, AxisStatus(0)))
         what = f"{where}, {_WORDS[dog.kind]} withheld: {_reaction(word) if seconds is not None else 'goes on'} after"
@@ -166,14 +170,16 @@ def watchdog_check(
         fault = bool(word & AxisStatus.FAULT and not word & AxisStatus.WATCHDOG)
         if fault:
             strange.append(f"{dog.drive} stopped for another reason ({word!r})")
-    if moving is not None and travel is not None:
-        unit = "rad" if model.chain.revolute[moving] else "m"
-        name = model.chain.names[moving]
+    if moving_joint is not None and travel is not None:
+        unit = "rad" if model.chain.revolute[moving_joint] else "m"
+        name = model.chain.names[moving_joint]
         found.append(measure("in motion, distance until at rest", travel, unit, joint=name))
         if travel == 0.0 and not strange:
             why = f"{name}: position unchanged to the last bit from the middle of a motion until at rest"
-            return failed(CODE, why, REMEDIES["frozen_encoder"], found)
-    return failed(CODE, "; ".join(strange), REMEDY, found) if strange else check_from_measures(CODE, found, REMEDY)
+            return failed_check(CODE, why, REMEDIES["frozen_encoder"], found)
+    return (
+        failed_check(CODE, "; ".join(strange), REMEDY, found) if strange else check_from_measures(CODE, found, REMEDY)
+    )
 
 
 def _most(dog: Watchdog, period: float, delay: float) -> float:

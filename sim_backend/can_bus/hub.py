@@ -17,7 +17,7 @@ from contextlib import suppress
 from threading import RLock
 from typing import Final, Self
 
-from drivers.can.bus_load import exact
+from drivers.can.bus_load import exact_bits
 from drivers.can.bus_state import BusError
 from drivers.can.can_frame import MAX_PACKET_BYTES, MAX_PACKET_FRAMES, Frame, pack_frames, unpack_frames
 from ident_service.errors import DriverError
@@ -249,9 +249,9 @@ def _pace(bitrate: int, data_bitrate: int | None) -> Callable[[Frame], int]:
 
     def duration_ns(frame: Frame) -> int:
         if not frame.fd:
-            return exact(frame).nominal * 1_000_000_000 // bitrate
+            return exact_bits(frame).nominal * 1_000_000_000 // bitrate
         if data_bitrate is None:  # it is destroyed there
             return BEFORE_FDF * 1_000_000_000 // bitrate
-        return round(1e9 * exact(frame, fd=True).seconds(bitrate, data_bitrate))
+        return round(1e9 * exact_bits(frame, fd=True).seconds(bitrate, data_bitrate))
 
     return duration_ns

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from drivers.canopen import object_dictionary as od
-from drivers.canopen.capabilities import family_of, parse_entry, speed_size, torque_unit
+from drivers.canopen.capabilities import family_of, parse_entry, speed_units_per_rpm, torque_unit_size
 from ident_service.config.canopen import CanopenDrive
 from ident_service.config.drive_family import Family, TorquePath, TorqueUnit
 from ident_service.config.eds import DataSheet, data_sheet
@@ -123,7 +123,7 @@ def personality_of(text: str, drive: CanopenDrive, families: Sequence[Family] = 
     paths = [path for path in family.torque if sheet.has(_key(path.target) >> 8)]
     unit = family.unit or TorqueUnit(rated="6076:0/u32", unit="mNm")
     constant = drive.torque_constant or _SOME_CONSTANT
-    scale = torque_unit(unit, drive.model_copy(update={"torque_constant": constant})) * (unit.count or 1.0)
+    scale = torque_unit_size(unit, drive.model_copy(update={"torque_constant": constant})) * (unit.count or 1.0)
     limits = {(_key(one.entry), None if one.per is None else _key(one.per), one.below) for one in family.torque_limit}
     path = paths[0] if paths else TorquePath(mode=10, target="6071:0/i16")
     amperes = drive.rated_torque / constant
@@ -151,7 +151,10 @@ def _speed(family: Family, sheet: DataSheet, drive: CanopenDrive) -> tuple[int, 
     unit = sheet.entries.get(od.VELOCITY_UNIT.key)
     told = None if unit is None else unit.number(drive.node)
     for text in family.speed_limit:
-        if _key(text) in sheet.entries and (size := speed_size(parse_entry(text, ""), told, drive)) is not None:
+        if (
+            _key(text) in sheet.entries
+            and (size := speed_units_per_rpm(parse_entry(text, ""), told, drive)) is not None
+        ):
             return _key(text), size
     return None
 

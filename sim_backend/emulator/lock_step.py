@@ -19,7 +19,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from drivers.can.bus_load import unstuffed
+from drivers.can.bus_load import unstuffed_bits
 from drivers.can.can_frame import Frame
 from drivers.clock import VirtualClock
 from ident_service.config.arm import ArmConfig
@@ -51,7 +51,7 @@ class LockStepBus:
         # A length that only CAN FD has takes its bits on any bus: tests send such frames, no controller does.
         kind = len(frame.data), len(frame.data) > _CLASSIC or (self.fd and not (frame.remote or frame.error))
         if (known := self._durations.get(kind)) is None:
-            bits, (bitrate, data_bitrate) = unstuffed(kind[0], fd=kind[1]), self._rates
+            bits, (bitrate, data_bitrate) = unstuffed_bits(kind[0], fd=kind[1]), self._rates
             known = self._durations[kind] = round(1e9 * bits.seconds(bitrate, data_bitrate or bitrate))
         return known
 

@@ -20,7 +20,7 @@ from drivers.barrett.protocol import (
     Status,
     address_of,
     position_frame,
-    reply,
+    reply_frame,
     request_of,
     torques_of,
 )
@@ -161,7 +161,7 @@ class EmulatedPuck:
             counts = self.motor.encoder(now_ns) + self._offset
             self._safety.watch_position(self._place, counts, now_ns)
             return [position_frame(self._node, counts, None if self._joint is None else self._joint(now_ns))]
-        return [reply(self._node, request.number, self._value(name, now_ns), wide=self._properties.is_wide(name))]
+        return [reply_frame(self._node, request.number, self._value(name, now_ns), wide=self._properties.is_wide(name))]
 
     def finish_sync(self, now_ns: int) -> list[Frame]:
         """Do nothing and return no frames: torques act when they come."""

@@ -24,9 +24,9 @@ from drivers.barrett.protocol import (
     Status,
     address_of,
     pendant_value,
-    put,
-    reply,
+    reply_frame,
     request_of,
+    set_frame,
     torques_of,
 )
 from drivers.can.can_frame import Frame
@@ -144,7 +144,7 @@ class EmulatedSafetyPuck:
                 return self._taken()
             if request.value is None:
                 value, wide = self._value(name), self._properties.is_wide(name)
-                return [*self._taken(), reply(self.number, request.number, value, wide=wide)]
+                return [*self._taken(), reply_frame(self.number, request.number, value, wide=wide)]
             self._set(name, request.value, now_ns)
         return self._taken()
 
@@ -245,7 +245,7 @@ class EmulatedSafetyPuck:
         motors = Mode.TORQUE if mode is SafetyMode.ACTIVE else Mode.IDLE
         for set_mode in self._motors:
             set_mode(motors, now_ns)
-        self._out.append(put(Group.ALL, self._properties.number("MODE"), motors, group=True, sender=self.number))
+        self._out.append(set_frame(Group.ALL, self._properties.number("MODE"), motors, group=True, sender=self.number))
 
     def _fault(self, cause: str, now_ns: int) -> None:
         if cause not in self._faults:

@@ -12,7 +12,7 @@ import pytest
 from drivers.arm import StopKind
 from drivers.axis_status import AxisEventCode, AxisStatus
 from drivers.barrett.driver import BarrettArm
-from drivers.barrett.protocol import Group, SafetyMode, address_of, get, request_of, torques_of
+from drivers.barrett.protocol import Group, SafetyMode, address_of, get_frame, request_of, torques_of
 from drivers.can.bus_state import BusError
 from drivers.can.can_frame import Frame
 from ident_service.cli import recovery_commands
@@ -131,7 +131,7 @@ def test_the_host_asks_one_question_and_sends_two_torque_frames_a_cycle_and_neve
         bench.taps[-1].sent.clear()
         bench.cycles(100, NONE)
         sent = bench.taps[-1].sent
-        assert sent.count(get(Group.ARM, 48, group=True)) == 100
+        assert sent.count(get_frame(Group.ARM, 48, group=True)) == 100
         assert sum(torques_of(frame.data) is not None for frame in sent) == 200
         # MODE of eight, the safety puck's twice, and the pendant, in every 50 ms: 25 cycles.
         assert 30 <= len(sent) - 300 <= 60
@@ -307,16 +307,16 @@ def test_looking_sets_nothing_and_keeps_no_active_arm_alive(bench: Bench) -> Non
             looking.enable()
         bench.behind.inject(DriveFault("watchdog_ignored"))
         bench.press("activate")
-        asked = bench.sent.count(get(Group.ARM, 48, group=True))
+        asked = bench.sent.count(get_frame(Group.ARM, 48, group=True))
         with pytest.raises(DriverError, match="another host drives it"):
             looking.exchange(None)
-        assert bench.sent.count(get(Group.ARM, 48, group=True)) == asked
+        assert bench.sent.count(get_frame(Group.ARM, 48, group=True)) == asked
     requests = [request_of(frame.data) for frame in bench.sent]
     assert all(request is not None and request.value is None for request in requests)
 
 
 def test_another_host_on_the_bus_is_not_disturbed_and_is_a_fault(bench: Bench) -> None:
-    foreign = get(Group.ARM, 48, group=True)
+    foreign = get_frame(Group.ARM, 48, group=True)
     with bench.arm as arm:
         arm.enable()
         bench.cycles(3, NONE)

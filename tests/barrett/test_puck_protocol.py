@@ -16,13 +16,13 @@ from drivers.barrett.protocol import (
     Role,
     address_of,
     decoded,
-    get,
+    get_frame,
     pendant_of,
     pendant_value,
     position_frame,
-    put,
-    reply,
+    reply_frame,
     request_of,
+    set_frame,
     torque_frame,
     torques_of,
 )
@@ -57,20 +57,20 @@ def test_positions_are_packed_as_the_vectors_say(counts: int, data: str) -> None
 
 
 def test_positions_are_requested_by_one_frame_and_answered_by_every_puck() -> None:
-    assert get(Group.ARM, Properties(200, Role.MOTOR).number("P"), group=True) == Frame(0x404, b"\x30")
+    assert get_frame(Group.ARM, Properties(200, Role.MOTOR).number("P"), group=True) == Frame(0x404, b"\x30")
     answered = [position_frame(node, 0).identifier for node in range(1, 8)]
     assert answered == [0x423, 0x443, 0x463, 0x483, 0x4A3, 0x4C3, 0x4E3]
 
 
 def test_requests_and_replies_have_the_documented_bytes() -> None:
-    assert put(10, 8, 1) == Frame(10, bytes([0x88, 0, 1, 0, 0, 0]))
-    assert put(3, 48, -36833).data == bytes([0xB0, 0, *(-36833).to_bytes(4, "little", signed=True)])
-    assert reply(3, 86, 2700, wide=False) == Frame(0x406 | 3 << 5, bytes([0xD6, 0, 0x8C, 0x0A]))
-    assert decoded(reply(3, 86, -2, wide=False)) == Reply(3, 86, -2)
-    assert decoded(reply(3, 68, 1 << 20, wide=True)) == Reply(3, 68, 1 << 20)
+    assert set_frame(10, 8, 1) == Frame(10, bytes([0x88, 0, 1, 0, 0, 0]))
+    assert set_frame(3, 48, -36833).data == bytes([0xB0, 0, *(-36833).to_bytes(4, "little", signed=True)])
+    assert reply_frame(3, 86, 2700, wide=False) == Frame(0x406 | 3 << 5, bytes([0xD6, 0, 0x8C, 0x0A]))
+    assert decoded(reply_frame(3, 86, -2, wide=False)) == Reply(3, 86, -2)
+    assert decoded(reply_frame(3, 68, 1 << 20, wide=True)) == Reply(3, 68, 1 << 20)
     assert request_of(bytes([0x88, 0, 2, 0])) == Request(8, 2)  # the short form, which is accepted as well
     with pytest.raises(DriverError, match="32 bits"):
-        put(1, 48, 1 << 31)
+        set_frame(1, 48, 1 << 31)
 
 
 def test_torques_out_of_range_are_not_sent() -> None:
@@ -182,6 +182,6 @@ def test_torques_come_back(number: int, counts: list[int]) -> None:
 
 @given(st.integers(1, 31), st.integers(0, 127), st.integers(-(1 << 31), (1 << 31) - 1))
 def test_properties_come_back(node: int, number: int, value: int) -> None:
-    assert decoded(reply(node, number, value, wide=True)) == Reply(node, number, value)
-    assert request_of(put(node, number, value).data) == Request(number, value)
-    assert request_of(get(node, number).data) == Request(number)
+    assert decoded(reply_frame(node, number, value, wide=True)) == Reply(node, number, value)
+    assert request_of(set_frame(node, number, value).data) == Request(number, value)
+    assert request_of(get_frame(node, number).data) == Request(number)

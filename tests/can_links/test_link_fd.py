@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from link_bench import PATIENCE, arm_on_bus, content, end_of, frames, soon, wait_for
 
-from drivers.can.bus_load import exact
+from drivers.can.bus_load import exact_bits
 from drivers.can.bus_state import BUS_OFF, BusError
 from drivers.can.can_frame import FD_LENGTHS, Frame, pack_frames, unpack_frames
 from drivers.can.can_link import open_links
@@ -69,7 +69,7 @@ def test_a_configured_link_sends_fd_and_python_can_sees_it(fd_wire: CanBusServer
 
 def test_its_pace_is_that_of_both_bit_rates(name: str) -> None:
     frame = Frame(0x201, bytes(range(64)), fd=True)
-    bits = exact(frame, fd=True)
+    bits = exact_bits(frame, fd=True)
     with WireThread(CanBusServer(name, SLOW, FAST)):
         sender, listener = end_of(name), end_of(name)
         sender.send_all([frame] * 5)
@@ -144,5 +144,5 @@ def test_an_error_lasts_as_long_on_either_wire(name: str) -> None:
         medium.offer(sender, frame, 0)
         medium.advance(10**9)
         ((heard, _),) = listener.take()
-        once = exact(frame, fd=frame.fd).seconds(SLOW, data_bitrate)
+        once = exact_bits(frame, fd=frame.fd).seconds(SLOW, data_bitrate)
         assert heard.stamp_ns == pytest.approx(2e9 * once + ERROR_BITS * 1e9 / SLOW, abs=2)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from link_bench import frames
 
-from drivers.can.bus_load import exact
+from drivers.can.bus_load import exact_bits
 from drivers.can.bus_state import BUS_OFF, CONTROLLER, COUNTERS, PASSIVE_RX, PASSIVE_TX, RESTARTED, WARNING_TX
 from drivers.can.can_frame import RECEIVE_FILTER, Frame
 from sim_backend.can_bus.hub import ERROR_BITS
@@ -46,18 +46,18 @@ def counted_bits(frame: Frame) -> int:
 
 @given(frames())
 def test_bits_of_a_frame_are_those_of_a_bit_by_bit_count(frame: Frame) -> None:
-    assert exact(frame).nominal == counted_bits(frame)
+    assert exact_bits(frame).nominal == counted_bits(frame)
 
 
 @given(frames())
 def test_bits_of_a_standard_frame_lie_between_the_formulas(frame: Frame) -> None:
     if not frame.extended:
         n = len(frame.data)
-        assert 47 + 8 * n <= exact(frame).nominal <= 47 + 8 * n + (33 + 8 * n) // 4
+        assert 47 + 8 * n <= exact_bits(frame).nominal <= 47 + 8 * n + (33 + 8 * n) // 4
 
 
 def test_bits_of_a_sync() -> None:
-    assert exact(Frame(0x080)).nominal == 51  # FIELDBUS 2.1
+    assert exact_bits(Frame(0x080)).nominal == 51  # FIELDBUS 2.1
 
 
 @given(frames(), frames())
@@ -70,7 +70,7 @@ def test_who_wins_is_who_sends_the_first_dominant_bit(one: Frame, other: Frame) 
 
 
 def on_wire(count: int, bitrate: int = 0) -> tuple[Medium, list[BusEndpoint]]:
-    duration = (lambda frame: exact(frame).nominal * 1_000_000_000 // bitrate) if bitrate else None
+    duration = (lambda frame: exact_bits(frame).nominal * 1_000_000_000 // bitrate) if bitrate else None
     medium = Medium(duration, ERROR_BITS * 1_000_000_000 // bitrate if bitrate else 0)
     ports = [BusEndpoint(f"port {k}") for k in range(count)]
     for port in ports:

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.can.bus_load import FD_LENGTHS, Bits, crc15, exact, padded, unstuffed, worst
+from drivers.can.bus_load import FD_LENGTHS, Bits, crc15, exact_bits, most_bits, padded_length, unstuffed_bits
 from drivers.can.can_frame import Frame
 
 # FIELDBUS.md 2.1: bytes, without stuffing, worst.
@@ -49,21 +49,21 @@ def content(frame: Frame) -> list[int]:
 
 @pytest.mark.parametrize(("length", "least", "most"), TABLE)
 def test_the_published_table_holds(length: int, least: int, most: int) -> None:
-    assert unstuffed(length) == Bits(least)
-    assert worst(length) == Bits(most)
+    assert unstuffed_bits(length) == Bits(least)
+    assert most_bits(length) == Bits(most)
 
 
 @given(frames)
 def test_a_length_is_that_of_a_count_bit_by_bit(frame: Frame) -> None:
     on_wire = sent(content(frame))
     assert all(on_wire[k : k + 6] not in ([0] * 6, [1] * 6) for k in range(len(on_wire) - 5))
-    assert exact(frame) == Bits(len(on_wire) + 13)
+    assert exact_bits(frame) == Bits(len(on_wire) + 13)
 
 
 @given(frames)
 def test_no_frame_is_longer_than_the_worst_or_shorter_than_without_stuffing(frame: Frame) -> None:
     length = len(frame.data)
-    assert unstuffed(length).nominal <= exact(frame).nominal <= worst(length).nominal
+    assert unstuffed_bits(length).nominal <= exact_bits(frame).nominal <= most_bits(length).nominal
 
 
 @given(st.binary(min_size=1, max_size=16))
@@ -75,24 +75,24 @@ def test_the_checksum_is_that_of_the_shift_register(data: bytes) -> None:
 def test_stuffing_can_be_nearly_as_bad_as_the_formula_says() -> None:
     # Runs of five, then of four alternating, with the stuffed bit as the first of each: 1111 0000 1111 ...
     data = bytes([0x3C, 0x3C, 0x3C, 0x3C, 0x3C, 0x3C, 0x3C, 0x3C])
-    assert exact(Frame(0x078, data)).nominal > unstuffed(8).nominal + 14
+    assert exact_bits(Frame(0x078, data)).nominal > unstuffed_bits(8).nominal + 14
 
 
 def test_sync_and_heartbeat_are_as_published() -> None:
-    assert exact(Frame(0x080)) == Bits(51)
-    beats = [exact(Frame(0x700 + node, b"\x05")).nominal for node in range(1, 8)]
+    assert exact_bits(Frame(0x080)) == Bits(51)
+    beats = [exact_bits(Frame(0x700 + node, b"\x05")).nominal for node in range(1, 8)]
     assert sum(beats) / len(beats) == pytest.approx(58.3, abs=0.05)
 
 
 def test_remote_extended_and_error_frames_have_lengths_too() -> None:
-    assert 47 <= exact(Frame(0x701, remote=True)).nominal <= 55
-    assert 67 <= exact(Frame(0x1234567, extended=True)).nominal <= 80
-    assert exact(Frame(0x040, bytes(8), error=True)) == Bits(0)
+    assert 47 <= exact_bits(Frame(0x701, remote=True)).nominal <= 55
+    assert 67 <= exact_bits(Frame(0x1234567, extended=True)).nominal <= 80
+    assert exact_bits(Frame(0x040, bytes(8), error=True)) == Bits(0)
 
 
 @pytest.mark.parametrize("length", FD_LENGTHS)
 def test_can_fd_keeps_its_order(length: int) -> None:
-    least, most = unstuffed(length, fd=True), worst(length, fd=True)
+    least, most = unstuffed_bits(length, fd=True), most_bits(length, fd=True)
     assert least.nominal == 30
     # ESI, DLC, data, stuff count, CRC, one fixed stuff bit in front and after every four bits.
     assert least.data == 5 + 8 * length + (4 + 17 + 6 if length <= 16 else 4 + 21 + 7)
@@ -102,8 +102,8 @@ def test_can_fd_keeps_its_order(length: int) -> None:
 
 @given(st.integers(0, 0x7FF), st.binary(max_size=64))
 def test_a_length_with_can_fd_lies_between_least_and_most(identifier: int, data: bytes) -> None:
-    bits, length = exact(Frame(identifier, data), fd=True), padded(len(data))
-    least, most = unstuffed(length, fd=True), worst(length, fd=True)
+    bits, length = exact_bits(Frame(identifier, data), fd=True), padded_length(len(data))
+    least, most = unstuffed_bits(length, fd=True), most_bits(length, fd=True)
     assert least.nominal <= bits.nominal <= most.nominal
     assert least.data <= bits.data <= most.data
     zeros = length - len(data)
@@ -118,9 +118,9 @@ def test_a_length_with_can_fd_lies_between_least_and_most(identifier: int, data:
 @pytest.mark.parametrize(("length", "fd"), [(9, False), (-1, False), (65, True)])
 def test_lengths_that_no_frame_has_are_refused(length: int, fd: bool) -> None:
     with pytest.raises(ValueError, match="bytes"):
-        unstuffed(length, fd=fd)
+        unstuffed_bits(length, fd=fd)
     with pytest.raises(ValueError, match="bytes"):
-        exact(Frame(1, bytes(max(length, 9 if not fd else 65))), fd=fd)
+        exact_bits(Frame(1, bytes(max(length, 9 if not fd else 65))), fd=fd)
 
 
 def test_bits_become_seconds_at_their_own_rate() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from can_arms import EDS, wam_driver
 
-from drivers.can.bus_load import Budget, unstuffed, worst
+from drivers.can.bus_load import Budget, most_bits, unstuffed_bits
 from drivers.canopen import object_dictionary as od
 from drivers.canopen.bus_load import EMERGENCY_SLOTS, HEARTBEAT_STATE, budget, frame_line
 from drivers.canopen.object_dictionary import Entry
@@ -52,8 +52,8 @@ def test_the_published_maps_cost_what_was_published(frames: Frames, least: int, 
     [([1] + [3] * 7 + [8] * 2, 774, 930), ([1] + [6] * 4 + [3] * 3 + [8] * 2, 870, 1050)],
 )
 def test_pucks_cost_what_was_published(lengths: list[int], least: int, most: int) -> None:
-    assert sum(unstuffed(length).nominal for length in lengths) == least
-    assert sum(worst(length).nominal for length in lengths) == most
+    assert sum(unstuffed_bits(length).nominal for length in lengths) == least
+    assert sum(most_bits(length).nominal for length in lengths) == most
 
 
 @pytest.mark.parametrize(

@@ -52,12 +52,12 @@ def test_single_torque_frames_go_to_one_drive_each() -> None:
 
 def test_what_else_is_sent() -> None:
     bus = codec()
-    assert bus.sync() == Frame(0x080)
-    assert bus.heartbeat() == Frame(0x77F, b"\x05")
-    assert bus.heartbeat(NmtState.PRE_OPERATIONAL) == Frame(0x77F, b"\x7f")
-    assert bus.control_word(3, 0x000F, 10) == Frame(0x303, b"\x0f\x00\x0a")
-    assert bus.nmt(NmtCommand.START) == Frame(0x000, b"\x01\x00")
-    assert bus.nmt(NmtCommand.ENTER_PRE_OPERATIONAL, 4) == Frame(0x000, b"\x80\x04")
+    assert bus.sync_frame() == Frame(0x080)
+    assert bus.heartbeat_frame() == Frame(0x77F, b"\x05")
+    assert bus.heartbeat_frame(NmtState.PRE_OPERATIONAL) == Frame(0x77F, b"\x7f")
+    assert bus.control_frame(3, 0x000F, 10) == Frame(0x303, b"\x0f\x00\x0a")
+    assert bus.nmt_frame(NmtCommand.START) == Frame(0x000, b"\x01\x00")
+    assert bus.nmt_frame(NmtCommand.ENTER_PRE_OPERATIONAL, 4) == Frame(0x000, b"\x80\x04")
 
 
 @pytest.mark.parametrize("bad", [[0] * 6, [0] * 6 + [32_768], [0] * 6 + [-32_769], [0] * 6 + [0.5], [None] * 7])
@@ -342,8 +342,8 @@ def change_nothing(frames: list[Frame]) -> None:
     expected = codec().torque_frames(TORQUES)
     for sent in stirred(bus, frames):
         assert sent == expected
-    assert bus.sync() == Frame(0x080)
-    assert bus.heartbeat() == Frame(0x77F, b"\x05")
+    assert bus.sync_frame() == Frame(0x080)
+    assert bus.heartbeat_frame() == Frame(0x77F, b"\x05")
     for drive in bus.drives:
         good = [
             frame

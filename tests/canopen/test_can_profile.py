@@ -28,7 +28,7 @@ def values(one: BusProfile, node: int, index: int) -> list[tuple[int, int]]:
 def writes(one: BusProfile, node: int) -> list[Write]:
     """Everything that a drive would be told that has nothing of it."""
     pdos = [write for pdo in one.pdos(node) for write in pdo.writes()]
-    off = [pdo.off for pdo in one.silenced(node)]
+    off = [pdo.off for pdo in one.unused_pdos(node)]
     return [*one.identifiers(node), *off, *pdos, one.heartbeat(node), *one.host_supervision(node)]
 
 

@@ -26,7 +26,7 @@ from canopen_run_bench import (
     write,
 )
 
-from drivers.can.bus_load import unstuffed
+from drivers.can.bus_load import unstuffed_bits
 from drivers.can.can_frame import Frame
 from drivers.can.can_link import Link, open_links
 from drivers.canopen.pdo_mapping import SDO_REPLY, SDO_REQUEST, SYNC
@@ -73,7 +73,7 @@ def test_an_answer_in_lock_step_takes_its_bits(tmp_path: Path, data_bitrate: int
     answer = link.receive(begin + 10**9)
     assert answer is not None
     assert (answer.identifier, answer.fd) == (SDO_REPLY + 1, data_bitrate is not None)
-    frame_s = unstuffed(8, fd=data_bitrate is not None).seconds(BITRATE, data_bitrate)
+    frame_s = unstuffed_bits(8, fd=data_bitrate is not None).seconds(BITRATE, data_bitrate)
     assert answer.stamp_ns - begin == pytest.approx(2e9 * frame_s, abs=2)
 
 

@@ -52,7 +52,7 @@ def checked(told: ArmConfig, real: ArmConfig, *faults: str) -> dict[str, Check]:
     behind = LockStepArm(real)
     behind.inject(*(parse_fault(fault, tuple(told.joints)) for fault in faults))
     arm = CanopenArm(told, lambda _: [behind.link(0)])
-    ticket = preflight(arm, arm_model(told), None, confirm=lambda question: told.name, look_seconds=0.2)
+    ticket = preflight(arm, arm_model(told), None, confirm=lambda question: told.name, idle_seconds=0.2)
     return {check.code: check for check in ticket.checks}
 
 
@@ -81,7 +81,7 @@ def test_a_drive_that_does_not_confirm_that_it_is_off_allows_no_motion(tmp_path:
             super().close()
 
     arm = InterruptibleArm(Arm(config, links), lambda: False)
-    ticket = preflight(arm, arm_model(config), None, confirm=lambda question: config.name, look_seconds=0.2)
+    ticket = preflight(arm, arm_model(config), None, confirm=lambda question: config.name, idle_seconds=0.2)
     assert ticket.verdict is Verdict.FAILED
     (bad,) = (check for check in ticket.checks if check.verdict is Verdict.FAILED)
     assert bad.reason.startswith("when the arm was closed: elbow: drive 2: node 2: ")

@@ -82,7 +82,9 @@ def behind(config: ArmConfig) -> Iterator[LockStepArm]:
 def moved(config: ArmConfig, latch: ActiveFaults) -> State:
     model = arm_model(config)
     with make_arm(config) as arm:
-        state = run(arm, model, excitation(model, "identification"), Story(), latch=latch, hold_seconds=0.1).state
+        state = run(
+            arm, model, excitation(model, "identification"), Story(), active_faults=latch, hold_seconds=0.1
+        ).state
     assert arm.unconfirmed() == ()
     return state
 
@@ -90,7 +92,7 @@ def moved(config: ArmConfig, latch: ActiveFaults) -> State:
 def test_an_arm_is_checked_moved_and_moved_again(config: ArmConfig, behind: LockStepArm) -> None:
     model = arm_model(config)
     motion = excitation(model, "identification")
-    told = preflight(make_arm(config), model, motion, confirm=lambda question: config.name, look_seconds=0.2)
+    told = preflight(make_arm(config), model, motion, confirm=lambda question: config.name, idle_seconds=0.2)
     assert told.verdict is Verdict.PASSED, [one.reason for one in told.checks if one.reason]
     assert list(behind.emulator.states) == LEFT
     for _ in range(2):

@@ -20,7 +20,7 @@ from ident_service.model.base_parameters import base_parameters
 from ident_service.model.expected_friction import expected_friction
 from ident_service.motion.ticket import Check, Verdict
 from ident_service.motion.trajectory import hold
-from ident_service.preflight.active_checks import DWELL, strokes
+from ident_service.preflight.active_checks import DWELL, plan_strokes
 from ident_service.preflight.session import Session
 from ident_service.preflight.watchdog import watchdog_check
 from ident_service.recordings.open import open_recording
@@ -109,7 +109,7 @@ def silent_in_motion(folder: Path, share: float, counts: int = 65536, fault: str
         limits, home = motion_limits(config), arm.exchange(None).position
         friction = expected_friction(model, limits, config.design.friction_guess)
         session = Session(arm, model, limits, arm.describe(), home, friction)
-        stroke = strokes(session, model, limits, only=0)[0]
+        stroke = plan_strokes(session, model, limits, only_joint=0)[0]
         begin = DWELL + share * stroke.there.duration
         session.energise()
         session.follow(hold(home), 0.2)

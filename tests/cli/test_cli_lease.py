@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from cli.conftest import COARSE, Ident, quick_arm
 
-from ident_service.motion.command_channel import in_use
+from ident_service.motion.command_channel import is_control_file_in_use
 from ident_service.registry.state_folder import control_path
 
 pytestmark = pytest.mark.slow
@@ -56,7 +56,7 @@ def test_a_preflight_and_a_run_end_with_their_input(state: Path, tmp_path: Path)
         assert code == 1
         assert document["report"]["state"] == "stopped"  # type: ignore[index]
         assert json.loads((Path(str(document["folder"])) / "ended.json").read_text())["state"] == "stopped"
-    assert not in_use(control_path(state, "planar2"))
+    assert not is_control_file_in_use(control_path(state, "planar2"))
 
 
 def test_where_nothing_moves_there_is_no_lease(ident: Ident) -> None:

@@ -38,7 +38,7 @@ from ident_service.errors import (
     UnknownId,
     UsageError,
 )
-from ident_service.motion.command_channel import in_use
+from ident_service.motion.command_channel import is_control_file_in_use
 from ident_service.registry.database import Database, note
 from ident_service.registry.state_folder import control_path
 
@@ -168,7 +168,7 @@ def test_an_exception_stops_the_arm(client: IdentClient, state: Path) -> None:
             next(job.live())
             raise ZeroDivisionError
     assert job.ended.state == "cancelled"
-    assert not in_use(control_path(state, "patient"))
+    assert not is_control_file_in_use(control_path(state, "patient"))
 
 
 def test_a_stop_elsewhere_ends_the_block(client: IdentClient) -> None:
@@ -226,7 +226,7 @@ def test_a_daemon_that_ends_says_what_becomes_of_the_motion(tmp_path: Path) -> N
             next(job.live())
             process.send_signal(signal.SIGTERM)
             process.wait(60)
-    assert not in_use(control_path(state, "quick"))
+    assert not is_control_file_in_use(control_path(state, "quick"))
 
 
 def test_a_line_that_breaks_is_told_in_whole_sentences() -> None:

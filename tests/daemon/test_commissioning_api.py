@@ -24,7 +24,7 @@ from ident_service.daemon.jobs.queue import LiveJob, LiveJobs, Progress, progres
 from ident_service.daemon.jobs.requests import Run
 from ident_service.daemon.live_stream import live_events
 from ident_service.daemon.routes.jobs import job_answer_document
-from ident_service.motion.command_channel import ControlFile, in_use
+from ident_service.motion.command_channel import ControlFile, is_control_file_in_use
 from ident_service.registry import jobs as rows
 from ident_service.registry.database import audit_log
 from ident_service.registry.state_folder import control_path
@@ -80,7 +80,7 @@ def test_a_run_ends_early(daemon: Asked, patient: str, state: Path, asked: str) 
         assert report["until"]["parameters"] == ["fv1", "fc1"]
         assert report["until"]["reached"]["share"] <= 0.3
         assert report["until"]["reached"]["seconds"] >= 5.0
-    assert not in_use(control_path(state, ARM))
+    assert not is_control_file_in_use(control_path(state, ARM))
 
 
 def test_only_operators_finish_and_nobody_is_reached_where_nothing_moves(daemon: Asked, arm: str, viewer: str) -> None:
@@ -275,7 +275,7 @@ def test_a_motion_ends_with_its_arm_at_rest(state: Path, how: str) -> None:
         known_arm(daemon, patient_text(ARM))
         job = daemon.begin({"kind": "run", "arm": ARM}, confirmed=True)
         if how != "silence":
-            daemon.follow(job["id"], lease=True, until=lambda _: in_use(control_path(state, ARM)))
+            daemon.follow(job["id"], lease=True, until=lambda _: is_control_file_in_use(control_path(state, ARM)))
         if how == "cancel":
             assert daemon.post(f"/api/v1/jobs/{job['id']}/cancel").status_code == 200
         elif how == "stop":
@@ -295,7 +295,7 @@ def test_a_motion_ends_with_its_arm_at_rest(state: Path, how: str) -> None:
     }
     assert ended["state"] == "cancelled"
     assert words.get(how, "the service ends") in ended["detail"]
-    assert not in_use(control_path(state, ARM))
+    assert not is_control_file_in_use(control_path(state, ARM))
     assert not (state / "arms" / ARM / "moving.json").exists()
     ending = state / "runs" / job["run"] / "ended.json"
     assert ended["run"] == (job["run"] if ending.parent.exists() else None)

@@ -20,7 +20,7 @@ from ident_service.cli import main
 from ident_service.client import IdentClient
 from ident_service.daemon.jobs.child_process import alive
 from ident_service.errors import ArmError, MotionRefused
-from ident_service.motion.command_channel import controlling_pid, in_use
+from ident_service.motion.command_channel import controlling_pid, is_control_file_in_use
 from ident_service.operations.moving_arms import is_held
 from ident_service.recordings.open import open_recording
 from ident_service.registry.database import Database
@@ -117,7 +117,7 @@ def kill_once(state: Path, seed: int) -> str:
         # At rest: nobody has the arm, and a motion that ended by itself left no mark. A command that was begun in the
         # instant of the kill takes the arm, finds no lease, and lets go.
         until = time.monotonic() + 30.0
-        while in_use(control_path(state, ARM)):
+        while is_control_file_in_use(control_path(state, ARM)):
             assert time.monotonic() < until, "somebody has the arm"
             time.sleep(0.1)
         assert not (state / "arms" / ARM / "moving.json").exists()
@@ -200,7 +200,7 @@ def test_an_arm_that_is_held_when_the_daemon_is_killed_is_reported_and_let_down_
         told = wait_for(lambda: "the motion ended: stopped" in client.job(begun).detail and client.job(begun))
         assert (told.state, told.held) == ("interrupted", False)
         assert client.wait(asked.id).state == "done"
-        assert not in_use(control_path(state, ARM))
+        assert not is_control_file_in_use(control_path(state, ARM))
         # Nothing holds it any more, and both commands say the same of it.
         capsys.readouterr()
         assert main(["supported", ARM, "--confirm", ARM, *words]) == 2
@@ -236,7 +236,7 @@ def test_a_terminated_daemon_stops_its_arm_first(state: Path) -> None:
         excited(client, job)
         process.send_signal(signal.SIGTERM)
         assert process.wait(60) == 0
-    assert not in_use(control_path(state, ARM))
+    assert not is_control_file_in_use(control_path(state, ARM))
     assert not (state / "serve.url").exists()
     with Database(state) as db:
         (row,) = db.rows("SELECT state, run FROM jobs WHERE id = ?", job)

@@ -23,7 +23,7 @@ from daemon.served import daemon_process, listening
 from ident_service.cli import main
 from ident_service.client import IdentClient
 from ident_service.errors import ArmError, ArmFault, UsageError
-from ident_service.motion.command_channel import ControlFile, in_use
+from ident_service.motion.command_channel import ControlFile, is_control_file_in_use
 from ident_service.operations.moving_arms import is_held
 from ident_service.registry import jobs as rows
 from ident_service.registry.database import FILE, Database, audit_log, note
@@ -311,7 +311,7 @@ def test_a_disk_that_fills_while_an_arm_without_brakes_moves_is_reported_while_i
         assert is_held(state, "quick")
         # The disk is still full when the motion ends: its end waits for room, and is told of once.
         client.arm("quick").supported(confirm="quick")
-        wait_for(lambda: not in_use(control_path(state, "quick")))
+        wait_for(lambda: not is_control_file_in_use(control_path(state, "quick")))
         wait_for(lambda: "cannot be entered yet" in log_of(state))
         time.sleep(2.5)
         assert log_of(state).count("cannot be entered yet") == 1

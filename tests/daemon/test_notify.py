@@ -19,7 +19,7 @@ from daemon.conftest import patient_text, quick_text
 from daemon.served import daemon_process, started
 from daemon.test_daemon_killed import ARM, begin, checked, excited
 
-from ident_service.motion.command_channel import in_use
+from ident_service.motion.command_channel import is_control_file_in_use
 from ident_service.registry.state_folder import control_path
 
 pytestmark = pytest.mark.slow
@@ -105,7 +105,7 @@ def test_the_daemon_alone_speaks_and_an_arm_rests_before_it_ends(state: Path, tm
         process.send_signal(signal.SIGTERM)
         told = manager.until("STOPPING=1")
         assert process.wait(60) == 0
-        assert not in_use(control_path(state, ARM))
+        assert not is_control_file_in_use(control_path(state, ARM))
     run = json.loads(next((state / "runs").glob("*/ended.json")).read_text())
     assert run["state"] == "stopped"
     assert before[0][0] == "READY=1"

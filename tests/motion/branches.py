@@ -193,7 +193,16 @@ def outcomes(
         try:
             with arm:
                 try:
-                    run(arm, which.model, which.motion, story, script, speed=speed, latch=latch, hold_seconds=HOLD)
+                    run(
+                        arm,
+                        which.model,
+                        which.motion,
+                        story,
+                        script,
+                        speed=speed,
+                        active_faults=latch,
+                        hold_seconds=HOLD,
+                    )
                 finally:
                     moments = list(truth)
                     arm.left_alone()

@@ -168,7 +168,7 @@ def is_latched(which: Subject, outcome: Outcome) -> None:
         assert len(fault.cause) > len(FAULTS[fault.code].means) + 10
         assert f"{fault.code}: {fault.cause}" in outcome.story.errors
     with pytest.raises(MotionRefused, match=codes[0]):
-        run(outcome.arm, which.model, which.motion, outcome.story, latch=outcome.latch)
+        run(outcome.arm, which.model, which.motion, outcome.story, active_faults=outcome.latch)
     for code in codes:
         outcome.latch.acknowledge(code)
     assert outcome.latch.faults == ()

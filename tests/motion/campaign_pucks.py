@@ -16,7 +16,7 @@ from motion_bench import JOINTS, TRUTH, WatchedArm, bench_config
 
 from drivers.arm import Sample
 from drivers.barrett.driver import BarrettArm
-from drivers.barrett.protocol import get, put, torque_frame
+from drivers.barrett.protocol import get_frame, set_frame, torque_frame
 from drivers.can.can_frame import Frame
 from ident_service.config.arm import ArmConfig
 from ident_service.config.motion_limits import motion_limits
@@ -28,9 +28,9 @@ from sim_backend.machine import Truth
 
 PERIOD = 1e-3
 FOREIGN: dict[str, Frame] = {
-    "foreign_request": get(4, 48, group=True),
+    "foreign_request": get_frame(4, 48, group=True),
     "foreign_torque": torque_frame(1, 42, (0, 0, 0, 0)),
-    "foreign_mode": put(10, 8, 1),
+    "foreign_mode": set_frame(10, 8, 1),
 }
 WIRE = ("lost_torques", *FOREIGN, "full_queue")
 SOON, STATUS = 3, 70  # cycles: on the bus; until everybody was asked, and the pendant why

@@ -55,8 +55,15 @@ class Bench:
         sample = replace(sample, **other)
         self.cycle += 1
         setpoint = rest(position if reference is None else reference)
-        usable, fault = self.guard.feedback(
-            sample, setpoint, velocity, correction, answer, elapsed, known=known, unexplained=unexplained
+        usable, fault = self.guard.check_feedback(
+            sample,
+            setpoint,
+            velocity,
+            correction,
+            answer,
+            elapsed,
+            elapsed_is_exact=known,
+            unexplained_torque=unexplained,
         )
         return usable.tolist(), fault
 

@@ -12,7 +12,7 @@ from ident_service.errors import MotionRefused
 from ident_service.excitation.trajectory import FourierPath, FourierSeries, PosturePath
 from ident_service.motion.sequencer import Paused
 from ident_service.motion.speed_scaling import ScaledMotion
-from ident_service.motion.stop_trajectory import after, stop
+from ident_service.motion.stop_trajectory import plan_stop, state_after
 from ident_service.motion.trajectory import PathReference, Reference, Setpoint, plan_trajectory, rest
 
 Array = np.ndarray
@@ -110,11 +110,11 @@ def _before_turning(
     for _ in range(int(rng.integers(1, 7))):
         size = np.array(rng.choice([-jerk, -jerk, 0.0, jerk]))
         back = -longest * rng.uniform() * np.linspace(0.0, 1.0, 2000)
-        way_back = after(state, size, back)
+        way_back = state_after(state, size, back)
         fits = (way_back.position >= lower) & (way_back.position <= upper)
         fits &= (np.abs(way_back.velocity) <= velocity) & (np.abs(way_back.acceleration) <= acceleration * (1 + 1e-12))
         last = len(fits) - 1 if fits.all() else max(int(np.argmin(fits)) - 1, 0)
-        state = after(state, size, back[last])
+        state = state_after(state, size, back[last])
     middle, sign = (lower + upper, -1.0) if rng.uniform() < 0.5 else (0.0, 1.0)
     return middle + sign * float(state.position), sign * float(state.velocity), sign * float(state.acceleration)
 
@@ -130,7 +130,7 @@ def reached(draw: st.DrawFn) -> Reached:
         reference, kind = random_reference(rng, limits, random_path(rng, limits))
         state = reference.at(float(rng.uniform(0.0, reference.duration)))
     if rng.uniform() < 0.25:
-        stopping, kind = stop(state, limits), f"stop out of {kind}"
+        stopping, kind = plan_stop(state, limits), f"stop out of {kind}"
         state = stopping.at(float(rng.uniform(0.0, stopping.duration)))
     return Reached(limits, state, kind)
 

@@ -85,7 +85,7 @@ class Rig:
             motion,
             self.story,
             Person(self.arm, **person),
-            latch=self.latch,
+            active_faults=self.latch,
             hold_seconds=HOLD,
         )
 
@@ -336,7 +336,7 @@ def led(rig: Rig, **leader: Any) -> Leader:
     rig.arm.open()
     controls = Leader(rig.arm, **leader)
     motion = excitation(rig.model, "identification")
-    run(rig.arm, rig.model, motion, rig.story, controls, latch=rig.latch, hold_seconds=HOLD)
+    run(rig.arm, rig.model, motion, rig.story, controls, active_faults=rig.latch, hold_seconds=HOLD)
     return controls
 
 
@@ -442,7 +442,7 @@ def test_controls_that_fail_do_not_let_a_held_arm_fall() -> None:
             excitation(rig.model, "identification"),
             rig.story,
             Failing(rig.arm),
-            latch=rig.latch,
+            active_faults=rig.latch,
             hold_seconds=HOLD,
         )
     assert rig.arm.stops == [StopKind.TORQUE_OFF]

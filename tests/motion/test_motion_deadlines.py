@@ -26,7 +26,7 @@ class Times:
         self.stamp += stamp
         self.woken += woken
         self.deadlines._findings.cycle += 1
-        return self.deadlines.cycle(self.stamp, self.woken)
+        return self.deadlines.judge_cycle(self.stamp, self.woken)
 
 
 def code(fault: Fault | None) -> str | None:
@@ -154,8 +154,8 @@ def test_a_stamp_that_may_be_too_late_tells_no_velocity() -> None:
 def test_a_computer_that_is_always_in_doubt_is_too_late_and_its_stamps_are_believed_at_last() -> None:
     deadlines, known, codes = Deadlines(FaultCounter(), 1e-3), [], []
     for cycle in range(100):
-        codes.append(code(deadlines.cycle(cycle * MS, cycle * MS + MS // 2, 300_000 if cycle else 0)))
-        known.append(deadlines.known)
+        codes.append(code(deadlines.judge_cycle(cycle * MS, cycle * MS + MS // 2, 300_000 if cycle else 0)))
+        known.append(deadlines.elapsed_is_exact)
     assert codes.index("late_cycles") == 51
     assert known == [True] + 3 * [False] + 96 * [True]
     assert deadlines.elapsed == 1e-3
@@ -178,7 +178,7 @@ def test_a_long_silence_is_one_whatever_the_stamps_say() -> None:
 @pytest.mark.parametrize("scheduled", [False, True])
 def test_the_first_cycle_has_no_schedule(scheduled: bool) -> None:
     deadlines = Deadlines(FaultCounter(), 1e-3, scheduled_stamps=scheduled)
-    assert deadlines.cycle(10**12, 10**15) is None
+    assert deadlines.judge_cycle(10**12, 10**15) is None
     assert deadlines.lateness_ns == 0
 
 

@@ -71,7 +71,7 @@ def test_a_run_is_refused_before_anything_is_energised_and_its_recording_says_wh
     model = arm_model(described)
     with opened(described, build) as (arm, _):
         with pytest.raises(DriverError, match=SAID) as refused:
-            run(arm, model, excitation(model, "identification"), story, latch=latch)
+            run(arm, model, excitation(model, "identification"), story, active_faults=latch)
         assert "Check termination, connectors, cable and bit rate of every node on bench" in str(refused.value)
         assert not any(word & 1 for word in arm.exchange(None).status)
     assert story.samples == []
@@ -83,7 +83,7 @@ def test_a_run_is_refused_before_anything_is_energised_and_its_recording_says_wh
 def test_preflight_says_so_before_a_person_is_asked_for_anything(build: Build, config: Callable[[], ArmConfig]) -> None:
     described, asked = config(), list[str]()
     arm, _ = passive_bus(described, build)
-    ticket = preflight(arm, arm_model(described), None, confirm=lambda text: asked.append(text) or "", look_seconds=0.2)
+    ticket = preflight(arm, arm_model(described), None, confirm=lambda text: asked.append(text) or "", idle_seconds=0.2)
     (check,) = [one for one in ticket.checks if one.verdict is Verdict.FAILED]
     assert (check.code, check.reason) == ("identities", SAID)
     assert check.remedy.startswith("Check termination")

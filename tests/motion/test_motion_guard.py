@@ -319,7 +319,7 @@ def anything() -> st.SearchStrategy[float]:
 @given(arrays(float, 2, elements=anything()))
 def test_whatever_is_wanted_what_leaves_is_finite_and_limited(wanted: Array) -> None:
     kept = wanted.copy()
-    leaves, fault = Bench().guard.torque(wanted)
+    leaves, fault = Bench().guard.limit_torque(wanted)
     assert np.isfinite(leaves).all()
     assert (np.abs(leaves) <= LIMITS.torque).all()
     np.testing.assert_array_equal(wanted, kept)
@@ -355,7 +355,7 @@ def test_whatever_is_seen_the_guard_does_not_fall_over(
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_torque_that_is_no_number_becomes_none(bad: float) -> None:
-    leaves, fault = Bench().guard.torque(np.array([1.0, bad]))
+    leaves, fault = Bench().guard.limit_torque(np.array([1.0, bad]))
     np.testing.assert_array_equal(leaves, 0.0)
     is_fault(fault, "torque_not_finite", 1)
 
@@ -365,12 +365,12 @@ def test_a_torque_that_is_no_number_becomes_none(bad: float) -> None:
 def test_thresholds_of_torque(joint: int, side: float) -> None:
     guard = Bench().guard
     limit = side * LIMITS.torque * unit(joint)
-    assert guard.torque(limit)[1] is None
+    assert guard.limit_torque(limit)[1] is None
     for times in (1.001, 0.999 * ABSURD):
-        leaves, fault = guard.torque(times * limit)
+        leaves, fault = guard.limit_torque(times * limit)
         is_fault(fault, "torque_saturated", joint)
         np.testing.assert_array_equal(leaves, limit)
-    leaves, fault = guard.torque(1.001 * ABSURD * limit)
+    leaves, fault = guard.limit_torque(1.001 * ABSURD * limit)
     is_fault(fault, "torque_absurd", joint)
     np.testing.assert_array_equal(leaves, 0.0)
     assert guard.warnings == {"torque_saturated": 2}
@@ -379,7 +379,7 @@ def test_thresholds_of_torque(joint: int, side: float) -> None:
 def test_a_moving_reference_is_compared_by_its_position_only() -> None:
     moving = Setpoint(HOME, LIMITS.velocity, LIMITS.acceleration)
     sample = Sample(0, 0, HOME.copy(), None, np.zeros(2), np.ones(2, dtype=bool), np.zeros(2, dtype=np.int64))
-    assert Bench().guard.feedback(sample, moving, STILL, STILL)[1] is None
+    assert Bench().guard.check_feedback(sample, moving, STILL, STILL)[1] is None
 
 
 @pytest.mark.parametrize(("share", "frozen"), [(0.99, False), (1.01, True)])

@@ -47,7 +47,7 @@ def test_motors_are_weaker_together_than_joints_alone() -> None:
 @settings(max_examples=100)
 @given(WANTED)
 def test_the_first_torque_is_scaled_as_a_whole(wanted: Array) -> None:
-    leaves, fault = guard().torque(wanted)
+    leaves, fault = guard().limit_torque(wanted)
     within = np.clip(wanted, -LIMITS.torque, LIMITS.torque)
     share = min(1.0, *(np.array(MOST) / np.maximum(np.abs(motors(within)), 1e-12)))
     np.testing.assert_allclose(leaves, share * within, rtol=1e-9, atol=1e-12)
@@ -61,7 +61,7 @@ def test_the_first_torque_is_scaled_as_a_whole(wanted: Array) -> None:
 def test_whatever_is_wanted_in_turn_no_motor_and_no_joint_gets_more_and_none_jumps(wanted: list[Array]) -> None:
     one, before = guard(), None
     for torque in wanted:
-        leaves, _ = one.torque(torque)
+        leaves, _ = one.limit_torque(torque)
         assert (np.abs(motors(leaves)) <= np.array(MOST) * SLACK).all()
         assert (np.abs(leaves) <= LIMITS.torque * SLACK).all()
         if before is not None:
@@ -71,15 +71,15 @@ def test_whatever_is_wanted_in_turn_no_motor_and_no_joint_gets_more_and_none_jum
 
 def test_what_is_wanted_for_long_is_reached() -> None:
     one, wanted = guard(), np.array([10.0, -3.0])
-    one.torque(np.zeros(2))
+    one.limit_torque(np.zeros(2))
     for _ in range(200):
-        leaves, fault = one.torque(wanted)
+        leaves, fault = one.limit_torque(wanted)
     np.testing.assert_array_equal(leaves, wanted)
     assert fault is None
 
 
 def test_the_sentence_names_the_motor() -> None:
-    _, fault = guard().torque(np.array([20.0, 14.0]))
+    _, fault = guard().limit_torque(np.array([20.0, 14.0]))
     assert fault is not None
     assert fault.code == "torque_saturated"
     wanted = motors(np.array([20.0, 14.0]))
@@ -89,4 +89,4 @@ def test_the_sentence_names_the_motor() -> None:
 
 def test_a_joint_alone_is_reported_as_before() -> None:
     one = SafetyMonitor(NAMES, replace(coupled_limits(), motors=None), PERIOD, HOME)
-    is_fault(one.torque(1.01 * LIMITS.torque * np.array([1.0, 0.0]))[1], "torque_saturated", 0)
+    is_fault(one.limit_torque(1.01 * LIMITS.torque * np.array([1.0, 0.0]))[1], "torque_saturated", 0)

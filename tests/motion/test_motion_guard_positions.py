@@ -24,7 +24,7 @@ def bench() -> Bench:
 def test_a_position_within_reach_leaves_as_it_is() -> None:
     guard = bench().guard
     wanted = HOME + 0.99 * STEP * np.array([1.0, -1.0])
-    leaves, fault = guard.position(wanted)
+    leaves, fault = guard.limit_position(wanted)
     assert fault is None
     np.testing.assert_array_equal(leaves, wanted)
 
@@ -34,7 +34,7 @@ def test_a_position_within_reach_leaves_as_it_is() -> None:
 def test_no_position_is_a_step_that_a_joint_may_not_make(wanted: Array) -> None:
     guard, before = bench().guard, HOME
     for _ in range(5):
-        leaves, fault = guard.position(wanted)
+        leaves, fault = guard.limit_position(wanted)
         assert (np.abs(leaves - before) <= STEP * (1.0 + 1e-9)).all()
         # Towards where it shall be, and never past it.
         assert ((leaves - before) * (wanted - before) >= 0.0).all()
@@ -51,7 +51,7 @@ def test_a_jump_is_bridged_once_and_stops_the_arm_when_it_goes_on() -> None:
     guard, reactions = bench().guard, []
     for number in range(FAULTS["position_rate"].often + 1):
         guard.findings.cycle += 1
-        _, fault = guard.position(HOME + 1.5 * (-1.0) ** number)
+        _, fault = guard.limit_position(HOME + 1.5 * (-1.0) ** number)
         assert fault is not None
         reactions.append(fault.reaction)
     assert reactions[:-1] == [WARN] * FAULTS["position_rate"].often
@@ -66,8 +66,8 @@ def test_what_is_no_number_or_outside_the_limits_ends_it_and_the_last_position_s
         (np.array([HOME[0], LIMITS.lower[1] - 1.0]), "position_outside"),
     ):
         guard = bench().guard
-        before, _ = guard.position(HOME + 0.5 * STEP)
-        leaves, fault = guard.position(wrong)
+        before, _ = guard.limit_position(HOME + 0.5 * STEP)
+        leaves, fault = guard.limit_position(wrong)
         assert is_fault(fault, code, joint=1)
         assert fault is not None
         assert fault.reaction is QUICK
@@ -153,7 +153,7 @@ def test_a_joint_that_stands_at_once_is_frozen_only_where_other_positions_are_gi
     seen, step, faults = bench(), 0.5 * LIMITS.velocity * PERIOD * unit(0), list[Fault | None]()
     for number in range(20):
         if goes_on or number < 4:
-            assert seen.guard.position(HOME + (number + 1) * step)[1] is None
+            assert seen.guard.limit_position(HOME + (number + 1) * step)[1] is None
         faults.append(seen.see(HOME + min(number, 3) * step, velocity=step / PERIOD)[1])
     codes = {fault.code for fault in faults if fault is not None}
     assert codes == ({"frozen_encoder"} if goes_on else set())

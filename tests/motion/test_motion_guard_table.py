@@ -37,26 +37,26 @@ TRUTHLESS = np.zeros(2)
 
 
 def torque_saturated(joint: int) -> Fault | None:
-    return Bench().guard.torque(1.01 * LIMITS.torque * unit(joint))[1]
+    return Bench().guard.limit_torque(1.01 * LIMITS.torque * unit(joint))[1]
 
 
 def torque_rate(joint: int) -> Fault | None:
     guard = Bench().guard
-    guard.torque(TRUTHLESS)
-    return guard.torque(1.01 * guard.rate * unit(joint))[1]
+    guard.limit_torque(TRUTHLESS)
+    return guard.limit_torque(1.01 * guard.rate * unit(joint))[1]
 
 
 def torque_absurd(joint: int) -> Fault | None:
-    return Bench().guard.torque(-1.01 * ABSURD * LIMITS.torque * unit(joint))[1]
+    return Bench().guard.limit_torque(-1.01 * ABSURD * LIMITS.torque * unit(joint))[1]
 
 
 def torque_not_finite(joint: int) -> Fault | None:
-    return Bench().guard.torque(np.where(unit(joint) > 0.0, np.nan, 0.0))[1]
+    return Bench().guard.limit_torque(np.where(unit(joint) > 0.0, np.nan, 0.0))[1]
 
 
 def torque_not_applied(joint: int) -> Fault | None:
     bench = Bench()
-    bench.guard.torque(TRUTHLESS)
+    bench.guard.limit_torque(TRUTHLESS)
     assert bench.see(HOME, torque=0.99 * NOT_APPLIED * LIMITS.torque)[1] is None
     return bench.see(HOME, torque=-1.01 * NOT_APPLIED * LIMITS.torque * unit(joint))[1]
 
@@ -104,7 +104,7 @@ def velocity_not_finite(joint: int) -> Fault | None:
 def acting_torque_not_finite(joint: int) -> Fault | None:
     bench, acting = Bench(), np.where(unit(joint) > 0.0, np.nan, 0.0)
     assert is_fault(bench.see(HOME, torque=acting)[1], "feedback_not_finite", joint)  # before any torque
-    bench.guard.torque(TRUTHLESS)
+    bench.guard.limit_torque(TRUTHLESS)
     return bench.see(HOME, torque=acting)[1]
 
 
@@ -190,15 +190,15 @@ def of_positions() -> Bench:
 
 
 def position_rate(joint: int) -> Fault | None:
-    return of_positions().guard.position(HOME + 1.01 * VELOCITY_STOP * LIMITS.velocity * PERIOD * unit(joint))[1]
+    return of_positions().guard.limit_position(HOME + 1.01 * VELOCITY_STOP * LIMITS.velocity * PERIOD * unit(joint))[1]
 
 
 def position_outside(joint: int) -> Fault | None:
-    return of_positions().guard.position(np.where(unit(joint) > 0.0, LIMITS.upper + 1e-6, HOME))[1]
+    return of_positions().guard.limit_position(np.where(unit(joint) > 0.0, LIMITS.upper + 1e-6, HOME))[1]
 
 
 def position_not_finite(joint: int) -> Fault | None:
-    return of_positions().guard.position(np.where(unit(joint) > 0.0, np.nan, HOME))[1]
+    return of_positions().guard.limit_position(np.where(unit(joint) > 0.0, np.nan, HOME))[1]
 
 
 def torque_exceeded(joint: int) -> Fault | None:
@@ -311,7 +311,7 @@ def test_old_warnings_are_forgotten() -> None:
     findings = FaultCounter()
     for _ in range(1000):
         findings.cycle += 5
-        assert findings.found("torque_rate", "x").code == "torque_rate"
+        assert findings.count_fault("torque_rate", "x").code == "torque_rate"
     assert findings.warnings == {"torque_rate": 1000}
 
 
@@ -334,13 +334,19 @@ def test_torques_are_reported_in_the_unit_of_the_joint(joint: int, unit_of_torqu
 
     asked = unit(joint) * LIMITS.torque
     guard = Bench(revolute=(True, False)).guard
-    assert f"{2.0 * LIMITS.torque[joint]:.4g} {unit_of_torque} was requested" in told(guard.torque(2.0 * asked)[1])
-    assert f"{4.0 * LIMITS.torque[joint]:.4g} {unit_of_torque} was requested" in told(guard.torque(4.0 * asked)[1])
+    assert f"{2.0 * LIMITS.torque[joint]:.4g} {unit_of_torque} was requested" in told(
+        guard.limit_torque(2.0 * asked)[1]
+    )
+    assert f"{4.0 * LIMITS.torque[joint]:.4g} {unit_of_torque} was requested" in told(
+        guard.limit_torque(4.0 * asked)[1]
+    )
     bench = Bench(revolute=(True, False))
-    bench.guard.torque(0.5 * asked)
+    bench.guard.limit_torque(0.5 * asked)
     words = told(bench.see(HOME, torque=np.zeros(2))[1])
     assert f"gives 0 of the {0.5 * LIMITS.torque[joint]:.4g} {unit_of_torque} commanded" in words
-    assert f" {unit_of_torque}/s, " in told(bench.guard.torque(0.5 * asked - 1.5 * bench.guard.rate * unit(joint))[1])
+    assert f" {unit_of_torque}/s, " in told(
+        bench.guard.limit_torque(0.5 * asked - 1.5 * bench.guard.rate * unit(joint))[1]
+    )
 
 
 def test_the_rate_of_torque_is_libfrankas_or_a_share() -> None:
@@ -351,12 +357,12 @@ def test_the_rate_of_torque_is_libfrankas_or_a_share() -> None:
 @pytest.mark.parametrize("sent", [np.zeros(2), np.array([5.0, -3.0])])
 def test_a_torque_that_jumps_is_led_there(sent: Array) -> None:
     guard = Bench().guard
-    guard.torque(sent)
-    leaves, fault = guard.torque(sent + np.array([0.5, -8.0]))
+    guard.limit_torque(sent)
+    leaves, fault = guard.limit_torque(sent + np.array([0.5, -8.0]))
     assert fault is not None
     assert fault.message.startswith("elbow: the torque was to change by -8000 N m/s")
     np.testing.assert_allclose(leaves, sent + np.array([0.5, -1.0]))
-    np.testing.assert_allclose(guard.torque(sent + np.array([0.5, -8.0]))[0], sent + np.array([0.5, -2.0]))
+    np.testing.assert_allclose(guard.limit_torque(sent + np.array([0.5, -8.0]))[0], sent + np.array([0.5, -2.0]))
 
 
 def test_the_worse_of_two_faults_of_a_torque_is_reported() -> None:
@@ -364,8 +370,8 @@ def test_the_worse_of_two_faults_of_a_torque_is_reported() -> None:
     codes = []
     for cycle in range(22):
         guard.findings.cycle = cycle
-        guard.torque(np.zeros(2))
-        fault = guard.torque(1.5 * LIMITS.torque)[1]
+        guard.limit_torque(np.zeros(2))
+        fault = guard.limit_torque(1.5 * LIMITS.torque)[1]
         assert fault is not None
         codes.append(fault.code)
     assert codes[0] == "torque_saturated"
@@ -420,8 +426,8 @@ def test_the_arm_touches_neither_boxes_nor_itself(position: tuple[float, float],
 
 def test_a_velocity_is_reported_with_its_joint_and_unit() -> None:
     bench = Bench(revolute=(True, False))
-    assert bench.guard.about(0, "moves at {} too long", 0.5) == "shoulder: moves at 0.5 rad/s too long"
-    assert bench.guard.about(1, "moves at {} too long", 0.25) == "elbow: moves at 0.25 m/s too long"
+    assert bench.guard.joint_message(0, "moves at {} too long", 0.5) == "shoulder: moves at 0.5 rad/s too long"
+    assert bench.guard.joint_message(1, "moves at {} too long", 0.25) == "elbow: moves at 0.25 m/s too long"
 
 
 def test_a_lost_axis_is_where_it_was_last_seen() -> None:

@@ -72,7 +72,7 @@ def a_step_aside(joint: int, side: float) -> None:
 
 def less_torque_than_asked_for(joint: int, side: float) -> None:
     bench = Bench()
-    bench.guard.torque(side * LIMITS.torque * unit(joint))
+    bench.guard.limit_torque(side * LIMITS.torque * unit(joint))
     acting = side * (1.0 - 0.999 * checks.NOT_APPLIED) * LIMITS.torque * unit(joint)
     assert bench.see(HOME, torque=acting, measured=STILL)[1] is None
 
@@ -154,8 +154,8 @@ def test_a_push_of_just_the_share_freezes_nothing() -> None:
 @pytest.mark.parametrize("wanted", [(8.0, -8.0), (8.0, 8.0), (-8.0, 0.0)])
 def test_torques_of_all_joints_are_led_where_they_jump_together(wanted: tuple[float, float]) -> None:
     guarded = Bench().guard
-    guarded.torque(STILL)
-    leaves, fault = guarded.torque(np.array(wanted))
+    guarded.limit_torque(STILL)
+    leaves, fault = guarded.limit_torque(np.array(wanted))
     is_fault(fault, "torque_rate")
     np.testing.assert_allclose(leaves, np.sign(wanted) * guarded.rate)
     assert fault is not None
@@ -166,8 +166,8 @@ def test_torques_of_all_joints_are_led_where_they_jump_together(wanted: tuple[fl
 
 def test_a_torque_that_changes_as_fast_as_it_may_is_not_led() -> None:
     guarded = Bench().guard
-    guarded.torque(STILL)
-    leaves, fault = guarded.torque(guarded.rate)
+    guarded.limit_torque(STILL)
+    leaves, fault = guarded.limit_torque(guarded.rate)
     assert fault is None
     np.testing.assert_array_equal(leaves, guarded.rate)
 

@@ -29,8 +29,8 @@ from ident_service.errors import MotionRefused
 from ident_service.excitation.trajectory import PosturePath
 from ident_service.motion.stop_trajectory import (
     StopProfile,
+    plan_stop,
     require_stops_within_limits,
-    stop,
     stop_extent,
 )
 from ident_service.motion.trajectory import PathReference, Setpoint, rest
@@ -46,7 +46,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 @some(25)
 @given(setpoints(LIMITS))
 def test_a_stop_ends_at_rest_within_limits(start: Setpoint) -> None:
-    reference = stop(start, _unlimited(LIMITS))
+    reference = plan_stop(start, _unlimited(LIMITS))
     close(reference.at(0.0), start)
     times, position, velocity, acceleration = sampled(reference)
     goes_together(LIMITS, times, position, velocity, acceleration)
@@ -68,7 +68,7 @@ def test_a_stop_ends_at_rest_within_limits(start: Setpoint) -> None:
 @given(st.floats(0.0, 1.0))
 def test_a_stop_out_of_an_excitation_passes_no_velocity_limit(share: float) -> None:
     exciting = PathReference(bench_excitation().path)
-    reference = stop(exciting.at(share * exciting.duration), LIMITS)
+    reference = plan_stop(exciting.at(share * exciting.duration), LIMITS)
     _, position, velocity, _ = sampled(reference, 200)
     assert (np.abs(velocity) <= LIMITS.velocity).all()
     assert (position >= LIMITS.lower).all()
@@ -78,20 +78,20 @@ def test_a_stop_out_of_an_excitation_passes_no_velocity_limit(share: float) -> N
 @settings(max_examples=100)
 @given(setpoints(LIMITS, 5.0))
 def test_a_stop_exists_even_from_beyond_the_limits(start: Setpoint) -> None:
-    end = stop(start, LIMITS).at(100.0)
+    end = plan_stop(start, LIMITS).at(100.0)
     np.testing.assert_allclose(end.velocity, 0.0, atol=1e-9)
     np.testing.assert_allclose(end.acceleration, 0.0, atol=1e-9)
 
 
 def test_a_stop_from_rest_stays() -> None:
-    reference = stop(rest(np.array([0.5, -0.5])), LIMITS)
+    reference = plan_stop(rest(np.array([0.5, -0.5])), LIMITS)
     assert reference.duration == 0.0
     np.testing.assert_array_equal(reference.at(1.0).position, [0.5, -0.5])
 
 
 def test_each_joint_stops_as_soon_as_it_can() -> None:
-    both = stop(Setpoint(np.zeros(2), np.array([2.0, 0.5]), np.zeros(2)), LIMITS)
-    alone = stop(Setpoint(np.zeros(2), np.array([0.0, 0.5]), np.zeros(2)), LIMITS)
+    both = plan_stop(Setpoint(np.zeros(2), np.array([2.0, 0.5]), np.zeros(2)), LIMITS)
+    alone = plan_stop(Setpoint(np.zeros(2), np.array([0.0, 0.5]), np.zeros(2)), LIMITS)
     assert alone.duration < both.duration
     assert both.at(alone.duration).velocity[1] == pytest.approx(0.0, abs=1e-9)
 
@@ -100,7 +100,7 @@ def test_each_joint_stops_as_soon_as_it_can() -> None:
 @some(50)
 @given(reached())
 def test_from_every_reachable_state_the_stop_stays_within_all_limits(case: Reached) -> None:
-    reference = stop(case.state, case.limits)
+    reference = plan_stop(case.state, case.limits)
     close(reference.at(0.0), case.state)
     close(reference.at(-0.5), case.state)
     keeps_to(case.limits, reference, 5e-6)  # what a way or a sampled motion may leave its limits by, unseen
@@ -117,7 +117,7 @@ def test_from_every_reachable_state_the_stop_stays_within_all_limits(case: Reach
 def test_a_stop_that_can_only_just_stay_inside_does(seed: int) -> None:
     rng = np.random.default_rng(seed)
     limits = random_limits(rng, 3)
-    reference = stop(turning_state(rng, limits), limits)
+    reference = plan_stop(turning_state(rng, limits), limits)
     keeps_to(limits, reference, 2e-7)
     lowest, highest = reference.extent()
     assert (lowest >= limits.lower - 2e-7).all()
@@ -135,7 +135,7 @@ def test_the_quickest_stop_overshoots_a_turning_point_by_less_than_its_bound(see
     rng = np.random.default_rng(seed)
     limits = random_limits(rng, 5)
     state = turning_state(rng, limits)
-    lowest, highest = stop(state, _unlimited(limits)).extent()
+    lowest, highest = plan_stop(state, _unlimited(limits)).extent()
     assert (highest <= limits.upper + _overshoot(limits) + 1e-7).all()
     assert (lowest >= limits.lower - _overshoot(limits) - 1e-7).all()
 
@@ -146,9 +146,9 @@ def test_the_bound_of_the_overshoot_is_reached() -> None:
     start = Setpoint(np.zeros(2), velocity, -LIMITS.acceleration)
     turning = 0.5 * velocity**2 / LIMITS.acceleration
     wide = _unlimited(LIMITS)
-    np.testing.assert_allclose(stop(start, wide).extent()[1] - turning, _overshoot(LIMITS), rtol=1e-9)
+    np.testing.assert_allclose(plan_stop(start, wide).extent()[1] - turning, _overshoot(LIMITS), rtol=1e-9)
     narrow = replace(LIMITS, upper=turning)
-    np.testing.assert_allclose(stop(start, narrow).extent()[1], turning, rtol=1e-9)
+    np.testing.assert_allclose(plan_stop(start, narrow).extent()[1], turning, rtol=1e-9)
     np.testing.assert_allclose(_overshoot(LIMITS), [8.0**3 / 24 / 80.0**2, 15.0**3 / 24 / 150.0**2])
 
 
@@ -156,7 +156,7 @@ def test_the_bound_of_the_overshoot_is_reached() -> None:
 @given(setpoints(LIMITS, 1.5))
 def test_a_stop_that_cannot_stay_inside_leaves_by_no_more_than_the_quickest(start: Setpoint) -> None:
     def leaves(limits: MotionLimits) -> Array:
-        lowest, highest = stop(start, limits).extent()
+        lowest, highest = plan_stop(start, limits).extent()
         return np.maximum(np.maximum(within.lower - lowest, highest - within.upper), 0.0)
 
     # In a narrow range the hardest braking would settle back beyond the other limit.
@@ -178,7 +178,7 @@ def test_the_quickest_stop_is_the_one_that_ruckig_finds(start: Setpoint) -> None
         setattr(parameters, f"max_{name}", getattr(LIMITS, name).tolist())
     expected = ruckig.Trajectory(2)
     ruckig.Ruckig(2).calculate(parameters, expected)
-    reference = stop(start, wide)
+    reference = plan_stop(start, wide)
     assert reference.duration == pytest.approx(expected.duration, abs=1e-12)
     for time in np.linspace(0.0, reference.duration, 20):
         close(reference.at(float(time)), Setpoint(*(np.array(column) for column in expected.at_time(time)[:3])))
@@ -188,7 +188,7 @@ def test_the_quickest_stop_is_the_one_that_ruckig_finds(start: Setpoint) -> None
 @pytest.mark.parametrize("signs", [(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0)])
 def test_a_stop_exists_from_far_beyond_the_limits(size: float, signs: tuple[float, float]) -> None:
     start = Setpoint(np.array([0.1, 9.0]), signs[0] * size * np.ones(2), signs[1] * size * np.ones(2))
-    reference = stop(start, LIMITS)
+    reference = plan_stop(start, LIMITS)
     end = reference.at(reference.duration)
     assert np.isfinite(end.position).all()
     assert not end.velocity.any()
@@ -201,7 +201,7 @@ def test_a_stop_exists_from_far_beyond_the_limits(size: float, signs: tuple[floa
 @some(25)
 @given(setpoints(LIMITS, 3.0))
 def test_an_acceleration_beyond_its_limit_is_led_back_first(start: Setpoint) -> None:
-    reference = stop(start, LIMITS)
+    reference = plan_stop(start, LIMITS)
     times, _, _, acceleration = sampled(reference, 800)
     allowed = np.maximum(np.abs(start.acceleration) - LIMITS.jerk * times[:, None], LIMITS.acceleration)
     assert (np.abs(acceleration) <= allowed + 1e-9).all()
@@ -212,7 +212,7 @@ def test_an_acceleration_beyond_its_limit_is_led_back_first(start: Setpoint) -> 
 @pytest.mark.parametrize("which", ["position", "velocity", "acceleration"])
 def test_a_stop_from_what_is_no_number_is_no_number_and_raises_nothing(which: str, bad: float) -> None:
     start = replace(rest(np.array([0.1, 0.2])), **{which: np.array([0.0, bad])})
-    reference = stop(start, LIMITS)
+    reference = plan_stop(start, LIMITS)
     assert not np.isfinite(reference.at(0.1).position[1])
     assert np.isfinite(reference.at(0.1).position[0])
 
@@ -226,7 +226,7 @@ def test_the_extent_of_the_stops_is_that_of_every_single_one(seed: int) -> None:
     path = random_path(rng, random_limits(rng, 3))
     times = np.concatenate([np.linspace(*ends, 2 + int((ends[1] - ends[0]) / 5e-3)) for ends in path.distinct])
     motion = PathReference(path)
-    singles = [stop(motion.at(float(time)), limits).extent() for time in times]
+    singles = [plan_stop(motion.at(float(time)), limits).extent() for time in times]
     lowest, highest = stop_extent(path, limits)
     np.testing.assert_allclose(lowest, np.min([low for low, _ in singles], axis=0), rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(highest, np.max([high for _, high in singles], axis=0), rtol=1e-9, atol=1e-9)
@@ -270,7 +270,7 @@ def test_the_extent_of_any_pieces_is_where_they_lead(seed: int) -> None:
 def test_the_extent_of_a_stop_is_where_it_goes(seed: int) -> None:
     rng = np.random.default_rng(seed)
     limits = random_limits(rng, 3)
-    reference = stop(turning_state(rng, limits), limits)
+    reference = plan_stop(turning_state(rng, limits), limits)
     lowest, highest = reference.extent()
     _, position, _, _ = sampled(reference, 2000)
     between = limits.acceleration * (reference.duration / 2000) ** 2

@@ -19,7 +19,7 @@ from motion_bench import Story
 
 from drivers.arm import Sample
 from drivers.barrett.driver import BarrettArm
-from drivers.barrett.protocol import Mode, Status, reply
+from drivers.barrett.protocol import Mode, Status, reply_frame
 from drivers.can.bus_state import BUS_OFF, RESTARTED
 from drivers.can.can_frame import Frame
 from drivers.canopen.driver import CanopenArm
@@ -255,11 +255,19 @@ def test_a_drive_that_restarts_shows_as_silence_first_and_is_named_in_the_end(ki
 @pytest.mark.parametrize(
     ("frames", "code", "words"),
     [
-        ([reply(1, MODE, Mode.IDLE, wide=False)], "drive_left", "puck 1: MODE 0, was 2"),
-        ([reply(1, MODE, m, wide=False) for m in (Mode.IDLE, Mode.TORQUE)], "drive_left", "puck 1: MODE 0, was 2"),
-        ([reply(1, STAT, Status.RESET, wide=False)], "drive_restarted", "puck 1: has restarted (STAT 0)"),
-        ([reply(1, STAT, s, wide=False) for s in (Status.RESET, Status.READY)], "drive_restarted", "puck 1: has re"),
-        ([reply(1, STAT, Status.ERROR, wide=False)], "drive_fault", "reports a fault"),
+        ([reply_frame(1, MODE, Mode.IDLE, wide=False)], "drive_left", "puck 1: MODE 0, was 2"),
+        (
+            [reply_frame(1, MODE, m, wide=False) for m in (Mode.IDLE, Mode.TORQUE)],
+            "drive_left",
+            "puck 1: MODE 0, was 2",
+        ),
+        ([reply_frame(1, STAT, Status.RESET, wide=False)], "drive_restarted", "puck 1: has restarted (STAT 0)"),
+        (
+            [reply_frame(1, STAT, s, wide=False) for s in (Status.RESET, Status.READY)],
+            "drive_restarted",
+            "puck 1: has re",
+        ),
+        ([reply_frame(1, STAT, Status.ERROR, wide=False)], "drive_fault", "reports a fault"),
         ([OFF, RESTART], "bus_off", "is bus-off"),
     ],
 )

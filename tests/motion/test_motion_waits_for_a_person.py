@@ -48,7 +48,7 @@ def moved(times: int, way: float, controls: Any = None, config: ArmConfig | None
     with LedArm(config, times, way) as arm:
         before = arm.exchange(None).position
         try:
-            report = run(arm, model, excitation(model, "identification"), story, controls, latch=latch)
+            report = run(arm, model, excitation(model, "identification"), story, controls, active_faults=latch)
         except (MotionRefused, ArmFault) as refused:
             return refused, story, latch
         finally:
@@ -144,7 +144,7 @@ def test_an_emergency_stop_that_is_pressed_while_a_person_is_waited_for_is_latch
         PressedArm(config, 0, 0.0) as arm,
         pytest.raises(ArmFault, match="release it, then press Shift-Idle") as stopped,
     ):
-        run(arm, model, excitation(model, "identification"), story, latch=latch)
+        run(arm, model, excitation(model, "identification"), story, active_faults=latch)
     assert stopped.value.code == "emergency_stop"
     assert [(fault.code, fault.cause) for fault in latch.faults] == [
         ("emergency_stop", "the emergency stop is pressed, or has been: release it, then press Shift-Idle")
@@ -155,7 +155,7 @@ def test_an_emergency_stop_that_is_pressed_while_a_person_is_waited_for_is_latch
 def test_preflight_names_an_emergency_stop_that_is_pressed_while_a_person_is_waited_for() -> None:
     config = PressedArm.config()
     name, arm = config.name, PressedArm(config, 0, 0.0)
-    ticket = preflight(arm, arm_model(config), None, confirm=lambda _: name, look_seconds=0.2)
+    ticket = preflight(arm, arm_model(config), None, confirm=lambda _: name, idle_seconds=0.2)
     (check,) = [one for one in ticket.checks if one.verdict is Verdict.FAILED]
     assert check.reason.startswith("the emergency stop is pressed, or has been: release it")
     assert "cables" not in check.remedy
@@ -192,6 +192,6 @@ def test_preflight_hears_another_host_that_comes_with_the_person() -> None:
     document = bench_puck_config().model_dump(mode="json", by_alias=True)
     document["joints"]["shoulder"]["torque"] = 30.0  # what its motor gives at most
     config = ArmConfig.model_validate(document)
-    ticket = preflight(SharedArm(config), arm_model(config), None, confirm=lambda _: config.name, look_seconds=0.2)
+    ticket = preflight(SharedArm(config), arm_model(config), None, confirm=lambda _: config.name, idle_seconds=0.2)
     (check,) = [one for one in ticket.checks if one.verdict is Verdict.FAILED]
     assert "somebody else sends frames 401h" in check.reason

@@ -18,7 +18,7 @@ from daemon.test_full_disk import held_text
 from page.conftest import Reached, log_in
 from playwright.sync_api import Browser, Page, expect
 
-from ident_service.motion.command_channel import in_use
+from ident_service.motion.command_channel import is_control_file_in_use
 from ident_service.operations.moving_arms import is_held
 from ident_service.registry import jobs as rows
 from ident_service.registry.arms import add_arm
@@ -172,7 +172,7 @@ def moving(page: Page, reached: Reached, place: Path) -> None:
     """A run on its way."""
     begin(page, reached, "Run")
     page.get_by_role("heading", name="The arm now").wait_for()
-    assert in_use(control_path(place, ARM))
+    assert is_control_file_in_use(control_path(place, ARM))
 
 
 @pytest.mark.parametrize("how", ["escape", "button", "without scripts", "leaving"])
@@ -205,7 +205,7 @@ def test_a_stop_in_the_middle(browser: Browser, reached: Reached, place: Path, h
     words = {"escape": "owner asked", "button": "owner asked", "without scripts": "looks asked", "leaving": "renewed"}
     assert words[how] in row["detail"]
     reached.service.engine.live.lease_factor = LEASES
-    assert not in_use(control_path(place, ARM))
+    assert not is_control_file_in_use(control_path(place, ARM))
 
 
 @pytest.mark.parametrize("where", ["here", "elsewhere"])
@@ -249,7 +249,7 @@ def test_support_is_confirmed_where_the_arm_waits_for_it(browser: Browser, reach
     support.click()
     assert ended(page) == "cancelled"
     expect(support).to_have_count(0)
-    assert not in_use(control_path(place, ARM))
+    assert not is_control_file_in_use(control_path(place, ARM))
 
 
 def test_a_run_is_finished_by_keyboard_and_its_target_is_shown(browser: Browser, reached: Reached, place: Path) -> None:
@@ -265,7 +265,7 @@ def test_a_run_is_finished_by_keyboard_and_its_target_is_shown(browser: Browser,
     job = rows.jobs(reached.service.db, arm=ARM, most=1)[0]
     report = json.loads((place / "runs" / job["run"] / "ended.json").read_text())
     assert (report["state"], report["finished"]) == ("done", "early")
-    assert not in_use(control_path(place, ARM))
+    assert not is_control_file_in_use(control_path(place, ARM))
 
 
 def test_a_rehearsal_moves_while_a_key_is_held(browser: Browser, reached: Reached, place: Path) -> None:
@@ -281,10 +281,10 @@ def test_a_rehearsal_moves_while_a_key_is_held(browser: Browser, reached: Reache
     page.keyboard.down(" ")
     expect(page.locator("#hold")).to_have_attribute("aria-pressed", "true")
     page.get_by_role("heading", name="The arm now").wait_for()
-    assert in_use(control_path(place, ARM))
+    assert is_control_file_in_use(control_path(place, ARM))
     page.keyboard.up(" ")
     assert ended(page) == "cancelled"
-    assert not in_use(control_path(place, ARM))
+    assert not is_control_file_in_use(control_path(place, ARM))
 
 
 @pytest.mark.campaign

@@ -15,7 +15,7 @@ from page.conftest import Reached, listening, log_in
 from playwright.sync_api import Browser, Page, expect
 
 from ident_service.daemon.maintenance.reidentification import reidentifications
-from ident_service.motion.command_channel import in_use
+from ident_service.motion.command_channel import is_control_file_in_use
 from ident_service.operations.drift_alarms import alarms
 from ident_service.operations.maintenance_schedule import pending
 from ident_service.registry import jobs as rows
@@ -96,7 +96,7 @@ def test_what_is_due_is_seen_and_done(browser: Browser, reached: Reached) -> Non
     page.evaluate("window.same = true")
     page.locator("#step-run.busy").wait_for()
     page.get_by_role("heading", name="The arm now").wait_for()
-    assert in_use(control_path(reached.service.state, ARM))
+    assert is_control_file_in_use(control_path(reached.service.state, ARM))
     assert page.evaluate("window.same")
     expect(page.locator("#lease-note")).to_be_visible()
     expect(page.locator("#values tr")).to_have_count(2)
@@ -171,7 +171,7 @@ def test_leaving_its_page_stops_the_arm_and_ends_it(browser: Browser, reached: R
         page.wait_for_timeout(100)
     assert (row["state"], row["step"]) == ("cancelled", "run")
     assert "renewed" in row["detail"]
-    assert not in_use(control_path(reached.service.state, ARM))
+    assert not is_control_file_in_use(control_path(reached.service.state, ARM))
     assert not rows.jobs(db, arm=ARM, states=rows.LIVE)
     page.goto(f"{reached.url}/reidentifications/{row['id']}")
     expect(page.locator(".verdict")).to_contain_text("It ended without a verdict")

@@ -109,7 +109,7 @@ class Flight:
         try:
             return preflight(
                 self.arm, self.model, self.motion, confirm=self.confirm, clock=self.clock,
-                **{"look_seconds": 0.2} | options,
+                **{"idle_seconds": 0.2} | options,
             )  # fmt: skip
         finally:
             assert all((np.abs(torque) <= LIMIT).all() for torque in self.arm.torques)
@@ -141,7 +141,9 @@ class Flown:
 
     def __post_init__(self) -> None:
         self.flight.arm.shown = lambda sample: self.seen.append(sample.position) or sample
-        self.ticket = self.flight.ticket(tell=lambda check: self.told.append(check.code), valid=timedelta(minutes=3))
+        self.ticket = self.flight.ticket(
+            on_check=lambda check: self.told.append(check.code), validity=timedelta(minutes=3)
+        )
 
 
 def check_of(ticket: Ticket, code: str) -> Check:

@@ -17,7 +17,7 @@ from ident_service.config.load import load_arm
 from ident_service.errors import MotionRefused, UsageError
 from ident_service.model.arm_model import arm_model
 from ident_service.motion import last_position
-from ident_service.motion.last_position import FILE, LastPosition, PositionFile, turned
+from ident_service.motion.last_position import FILE, LastPosition, PositionFile, whole_turns_text
 from ident_service.motion.ticket import Check, Verdict
 from ident_service.operations.recovery import set_home
 from ident_service.preflight.preflight import preflight
@@ -58,7 +58,7 @@ def moved(config: ArmConfig, *motor_turns: float) -> str:
     turns = np.array([*motor_turns, *[0.0] * (count - len(motor_turns))])
     last = np.linspace(-0.5, 0.7, count)
     away = np.linalg.solve(np.diag(gears.ratios) @ coupling, 2.0 * np.pi * turns)
-    return turned(LastPosition(last, WHEN), last + away, config)
+    return whole_turns_text(LastPosition(last, WHEN), last + away, config)
 
 
 def test_whole_turns_of_a_motor_are_named_and_what_a_hand_does_is_not() -> None:
@@ -80,7 +80,7 @@ def test_whole_turns_of_a_motor_are_named_and_what_a_hand_does_is_not() -> None:
 def test_an_arm_without_gears_has_no_turns() -> None:
     planar2 = load_arm("planar2")
     assert planar2.transmission is None
-    assert turned(LastPosition(np.zeros(2), WHEN), np.array([2.0 * np.pi, 0.0]), planar2) == ""
+    assert whole_turns_text(LastPosition(np.zeros(2), WHEN), np.array([2.0 * np.pi, 0.0]), planar2) == ""
 
 
 def test_the_position_is_kept_after_the_arm_was_closed_and_compared_when_it_is_opened(
@@ -105,7 +105,7 @@ def test_the_position_is_kept_after_the_arm_was_closed_and_compared_when_it_is_o
 def checks(behind: LockStepArm, config: ArmConfig, closed: LastPosition | None) -> dict[str, Check]:
     """What preflight says up to where it would hold the arm, which nobody confirms."""
     arm = opened_by(behind, config)
-    ticket = preflight(arm, arm_model(config), None, look_seconds=0.2, closed=closed)
+    ticket = preflight(arm, arm_model(config), None, idle_seconds=0.2, last_position=closed)
     return {check.code: check for check in ticket.checks}
 
 

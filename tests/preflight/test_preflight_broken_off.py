@@ -35,12 +35,12 @@ def stopped(flight: Flight, after: int) -> Arm:
 
 
 def checked(flight: Flight, arm: Arm, motion: Excitation | None) -> Ticket:
-    return preflight(arm, flight.model, motion, confirm=flight.confirm, clock=flight.clock, look_seconds=0.2)
+    return preflight(arm, flight.model, motion, confirm=flight.confirm, clock=flight.clock, idle_seconds=0.2)
 
 
 def for_a_way_home(ticket: Ticket) -> list[str]:
     """Why it does not allow the path home on the same arm."""
-    return ticket.valid_for(replace(ticket.subject, excitation="", excitation_sha256=""), ticket.created)
+    return ticket.objections_to(replace(ticket.subject, excitation="", excitation_sha256=""), ticket.created)
 
 
 @pytest.mark.parametrize("ends", [bus_goes, stopped])
@@ -94,7 +94,7 @@ def test_a_stop_that_is_requested_while_a_person_thinks_keeps_the_drives_off() -
         return flight.typed
 
     arm = InterruptibleArm(flight.arm, lambda: "asked" in flight.arm.calls)
-    ticket = preflight(arm, flight.model, flight.motion, confirm=confirm, clock=flight.clock, look_seconds=0.2)
+    ticket = preflight(arm, flight.model, flight.motion, confirm=confirm, clock=flight.clock, idle_seconds=0.2)
     assert "asked" in flight.arm.calls
     assert "enable" not in flight.arm.calls
     assert check_of(ticket, "gravity").reason == "a stop was requested"

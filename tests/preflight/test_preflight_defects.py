@@ -412,7 +412,7 @@ def test_a_drive_that_limits_its_torque_is_named_and_not_the_joint_that_it_drags
     # As the drives tell it: the arm of the other tests says that the torque asked for has acted.
     model = arm_model(load_arm("planar2"))
     arm = from_config(model.config, faults=(Fault(3000, FaultKind.TORQUE_SATURATION, 0, FOREVER, 0.02),))
-    check = only_failure(preflight(arm, model, None, confirm=lambda question: "planar2", look_seconds=0.3), "direction")
+    check = only_failure(preflight(arm, model, None, confirm=lambda question: "planar2", idle_seconds=0.3), "direction")
     assert check.reason.startswith("repeated_warnings: torque_not_applied in more than 20 of the last 100 cycles")
     assert "(shoulder: the drive gives 0.8 of the " in check.reason
     assert " N m commanded)" in check.reason

@@ -127,7 +127,7 @@ def test_a_driver_that_does_not_tell_about_its_drives_gets_no_ticket_and_nobody_
     assert "Sample.status" in check.remedy
     assert flight.questions == []
     assert "enable" not in flight.arm.calls
-    assert ticket.valid_for(ticket.subject, ticket.created) == ["checks failed: watchdog"]
+    assert ticket.objections_to(ticket.subject, ticket.created) == ["checks failed: watchdog"]
 
 
 def test_the_ticket_is_stamped_by_the_clock_it_is_given(good: Flown) -> None:
@@ -141,7 +141,7 @@ def test_the_watchdog_of_a_plant_in_its_own_process_is_seen_to_act(monkeypatch: 
     driver = {"kind": "simulated", "truth": TRUTH, "encoder_resolution": 2e-5, "process": "separate"}
     flight = Flight(changes={"driver": driver})
     ticket = preflight(
-        make_arm(flight.model.config), flight.model, flight.motion, confirm=lambda question: "bench", look_seconds=0.2
+        make_arm(flight.model.config), flight.model, flight.motion, confirm=lambda question: "bench", idle_seconds=0.2
     )
     assert ticket.verdict is Verdict.PASSED
     *took, travel = [one.value or 0.0 for one in check_of(ticket, "watchdog").measures]
@@ -155,7 +155,7 @@ def test_a_shipped_arm_with_geometry_and_noise_passes(name: str) -> None:
     """Gears as dry as the six-axis arm's change the torque fastest, where a test motion sets off."""
     model = arm_model(load_arm(name))
     motion = excitation(model, "identification")
-    ticket = preflight(make_arm(model.config), model, motion, confirm=lambda question: name, look_seconds=0.2)
+    ticket = preflight(make_arm(model.config), model, motion, confirm=lambda question: name, idle_seconds=0.2)
     assert ticket.verdict is Verdict.PASSED, [check.reason for check in ticket.checks]
     assert any(one.what == "clearance" for one in check_of(ticket, "motion_proven").measures)
     assert any("clearance" in one.what for one in check_of(ticket, "ways_clear").measures)

@@ -58,11 +58,11 @@ def test_an_arm_inside_or_a_little_outside_passes(start: float) -> None:
 
 def is_for_this_arm_only(ticket: Ticket) -> None:
     subject, now = ticket.subject, ticket.created
-    assert ticket.valid_for(subject, now) == []
-    assert ticket.valid_for(replace(subject, excitation="identification", excitation_sha256="0" * 64), now) == [
+    assert ticket.objections_to(subject, now) == []
+    assert ticket.objections_to(replace(subject, excitation="identification", excitation_sha256="0" * 64), now) == [
         "the motion has changed since"
     ]
-    assert ticket.valid_for(replace(subject, model_sha256="0" * 64), now) != []
+    assert ticket.objections_to(replace(subject, model_sha256="0" * 64), now) != []
 
 
 def test_farther_outside_nothing_is_touched() -> None:

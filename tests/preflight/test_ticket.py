@@ -24,11 +24,11 @@ from ident_service.motion.ticket import (
     Ticket,
     Verdict,
     check_from_measures,
-    failed,
+    failed_check,
     measure,
     new_ticket,
     read_ticket,
-    skipped,
+    skipped_check,
     subject_of,
     ticket_from_json,
     ticket_values,
@@ -56,30 +56,33 @@ def later(**by: float) -> Any:
 
 
 def test_a_ticket_counts_for_what_was_checked_for_a_quarter_of_an_hour() -> None:
-    assert ticket().valid_for(SUBJECT, later(minutes=14, seconds=59)) == []
-    assert "expired" in ticket().valid_for(SUBJECT, later(minutes=15))[0]
-    assert "clock" in ticket().valid_for(SUBJECT, later(seconds=-1))[0]
+    assert ticket().objections_to(SUBJECT, later(minutes=14, seconds=59)) == []
+    assert "expired" in ticket().objections_to(SUBJECT, later(minutes=15))[0]
+    assert "clock" in ticket().objections_to(SUBJECT, later(seconds=-1))[0]
 
 
 @pytest.mark.parametrize(
     ("verdict", "reason"),
     [
-        (failed("noise", "too much", "less"), "failed: noise"),
+        (failed_check("noise", "too much", "less"), "failed: noise"),
         (Check("watchdog", Verdict.NEEDS_PERSON), "failed: watchdog"),
-        *((skipped(code, "could not be made"), f"not made: {code}") for code in ("gravity", "direction", "watchdog")),
+        *(
+            (skipped_check(code, "could not be made"), f"not made: {code}")
+            for code in ("gravity", "direction", "watchdog")
+        ),
     ],
 )
 def test_a_ticket_that_did_not_pass_counts_for_nothing(verdict: Check, reason: str) -> None:
-    (found,) = ticket(verdict).valid_for(SUBJECT, later())
+    (found,) = ticket(verdict).objections_to(SUBJECT, later())
     assert reason in found
     assert ticket(verdict).verdict is not Verdict.PASSED
 
 
 def test_failure_outweighs_a_missing_person_and_skipped_checks_pass() -> None:
     person = Check("watchdog", Verdict.NEEDS_PERSON)
-    assert ticket(person, failed("noise", "x", "y")).verdict is Verdict.FAILED
+    assert ticket(person, failed_check("noise", "x", "y")).verdict is Verdict.FAILED
     assert ticket(person).verdict is Verdict.NEEDS_PERSON
-    assert ticket(skipped("rate", "virtual")).verdict is Verdict.PASSED
+    assert ticket(skipped_check("rate", "virtual")).verdict is Verdict.PASSED
 
 
 def of_config(**changes: Any) -> Subject:
@@ -104,26 +107,26 @@ OTHERS: list[tuple[Callable[[], Subject], str]] = [
 
 @pytest.mark.parametrize(("other", "reason"), OTHERS)
 def test_any_change_asks_for_a_new_check(other: Callable[[], Subject], reason: str) -> None:
-    found = ticket().valid_for(other(), later())
+    found = ticket().objections_to(other(), later())
     assert any(reason in one for one in found), found
 
 
 @pytest.mark.parametrize("code", ["motion_fits", "motion_proven", "ways_clear"])
 def test_a_path_home_asks_for_nothing_that_is_about_the_motion(code: str) -> None:
     home = subject_of(MODEL, None, ARM)
-    assert ticket(failed(code, "not this motion", "another")).valid_for(home, later()) == []
-    assert ticket(failed(code, "not this motion", "another")).valid_for(SUBJECT, later()) != []
+    assert ticket(failed_check(code, "not this motion", "another")).objections_to(home, later()) == []
+    assert ticket(failed_check(code, "not this motion", "another")).objections_to(SUBJECT, later()) != []
 
 
-@pytest.mark.parametrize("check", [failed("direction", "x", "y"), Check("watchdog", Verdict.NEEDS_PERSON)])
+@pytest.mark.parametrize("check", [failed_check("direction", "x", "y"), Check("watchdog", Verdict.NEEDS_PERSON)])
 def test_a_path_home_asks_for_all_that_is_about_the_arm(check: Check) -> None:
     home = subject_of(MODEL, None, ARM)
-    assert f"failed: {check.code}" in ticket(check).valid_for(home, later())[0]
+    assert f"failed: {check.code}" in ticket(check).objections_to(home, later())[0]
     others = subject_of(MODEL, None, replace(ARM, identities=("a 1", "b 3")))
-    assert "the drives are not those that were checked (axis 2: no longer b 2, now b 3)" in ticket().valid_for(
+    assert "the drives are not those that were checked (axis 2: no longer b 2, now b 3)" in ticket().objections_to(
         others, later()
     )
-    assert "expired" in ticket().valid_for(home, later(minutes=15))[0]
+    assert "expired" in ticket().objections_to(home, later(minutes=15))[0]
 
 
 def test_what_does_not_matter_does_not_change_the_subject() -> None:
@@ -133,8 +136,8 @@ def test_what_does_not_matter_does_not_change_the_subject() -> None:
 
 def test_a_ticket_is_kept_to_the_last_bit(tmp_path: Path) -> None:
     made = ticket(
-        failed("noise", "elbow: 1/3", "shield it", [measure("std", 1.0 / 3.0, "rad", joint="elbow", most=0.1)]),
-        skipped("rate", "virtual"),
+        failed_check("noise", "elbow: 1/3", "shield it", [measure("std", 1.0 / 3.0, "rad", joint="elbow", most=0.1)]),
+        skipped_check("rate", "virtual"),
         check_from_measures("gravity", [measure("difference", float("nan"), "N m")], "x"),
     )
     path = tmp_path / "ticket.json"
@@ -205,7 +208,9 @@ def test_the_text_says_what_to_do() -> None:
     text = ticket_text(ticket())
     assert "the arm may move until 2023-11-14 22:28:20 UTC" in text
     assert "elbow: drift 0.01 rad/s, at most 0.1" in text
-    text = ticket_text(ticket(failed("noise", "elbow: too loud", "Check shielding."), skipped("direction", "because")))
+    text = ticket_text(
+        ticket(failed_check("noise", "elbow: too loud", "Check shielding."), skipped_check("direction", "because"))
+    )
     assert "NOT ALLOWED TO MOVE" in text
     assert "FAILED     feedback is quiet" in text
     assert "-> Check shielding." in text

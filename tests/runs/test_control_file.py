@@ -10,7 +10,7 @@ import pytest
 
 from ident_service.cli import main
 from ident_service.errors import DriverError, UsageError
-from ident_service.motion.command_channel import ControlFile, in_use
+from ident_service.motion.command_channel import ControlFile, is_control_file_in_use
 from ident_service.operations.moving_arms import stop_arms
 from ident_service.registry.state_folder import control_path
 
@@ -124,7 +124,7 @@ def test_a_stop_before_the_machine_was_started_anew_is_none(tmp_path: Path) -> N
     time = Time()
     ControlFile.stop_motions(loop_path(tmp_path), time)
     time.now -= 3_000_000_000
-    with ControlFile.take(loop_path(tmp_path), None, time, requested_ns=time.now - 1) as loop:
+    with ControlFile.take(loop_path(tmp_path), None, time, motion_requested_ns=time.now - 1) as loop:
         assert not loop.stop
 
 
@@ -168,7 +168,7 @@ def test_an_arm_whose_controls_cannot_be_opened_is_not_said_to_be_at_rest(tmp_pa
     blocked.rmdir()
     blocked.symlink_to(blocked)
     with pytest.raises(DriverError, match="Too many levels of symbolic links"):
-        in_use(blocked)
+        is_control_file_in_use(blocked)
 
 
 def test_a_stop_that_comes_while_the_controls_are_taken_is_not_lost(tmp_path: Path) -> None:

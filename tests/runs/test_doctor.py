@@ -27,7 +27,7 @@ from ident_service.motion.doctor import (
     measure_wake_up,
     measuring_rate,
 )
-from ident_service.motion.realtime import IDLE_DRIVER, halts
+from ident_service.motion.realtime import IDLE_DRIVER, idle_cores_halt
 
 GOOD = {
     "sys/kernel/realtime": "1\n",
@@ -126,7 +126,7 @@ def test_limits_of_a_user_without_privileges_are_reported_with_the_lines_that_me
     state, found, remedy = told["locked memory"]
     assert (state, found.split(";")[0]) == ("poor", "4 kB for this user")
     assert "memlock unlimited" in remedy
-    if Path("/dev/cpu_dma_latency").exists() and os.getuid() == 0 and not halts(IDLE_DRIVER):
+    if Path("/dev/cpu_dma_latency").exists() and os.getuid() == 0 and not idle_cores_halt(IDLE_DRIVER):
         assert told["deep sleep of cores"][0] == "poor"
         assert "udev" in told["deep sleep of cores"][2]
 

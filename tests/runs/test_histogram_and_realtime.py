@@ -31,12 +31,12 @@ def test_a_share_of_all_times_is_below_what_it_says(times: list[int], share: flo
         histogram.add(one)
     assert histogram.count == len(times)
     assert histogram.worst_ns == max(times)
-    assert np.mean(np.array(times) <= histogram.below_us(share) * 1e3 + 1e-6) >= share
+    assert np.mean(np.array(times) <= histogram.quantile_us(share) * 1e3 + 1e-6) >= share
     assert sum(histogram.document()["counts"]) == len(times)
 
 
 def test_nothing_was_counted_yet() -> None:
-    assert Histogram().below_us(0.999) == 0.0
+    assert Histogram().quantile_us(0.999) == 0.0
 
 
 def test_requests_to_the_kernel_are_answered_in_words_and_nothing_fails() -> None:
@@ -148,11 +148,11 @@ def test_a_core_is_kept_from_halting_where_the_kernel_cannot_and_no_longer_than_
                 assert os.sched_getscheduler(pid) == os.SCHED_IDLE
                 assert os.sched_getaffinity(pid) == {granted.core}
         assert not spinners()
-    assert not realtime.halts(tmp_path / "none")
+    assert not realtime.idle_cores_halt(tmp_path / "none")
 
 
 def test_what_cannot_be_put_on_its_core_is_not_left_running_and_nothing_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(realtime, "halts", lambda driver: True)
+    monkeypatch.setattr(realtime, "idle_cores_halt", lambda driver: True)
     refusals = list[str]()
     with ExitStack() as held:
         assert not realtime._keep_from_halting(8191, held, refusals)
@@ -164,7 +164,7 @@ def test_what_cannot_be_put_on_its_core_is_not_left_running_and_nothing_fails(mo
 def test_what_keeps_a_core_from_halting_ends_with_a_loop_that_is_killed() -> None:
     code = (
         "import os, sys, contextlib; from pathlib import Path; from ident_service.motion import realtime\n"
-        "realtime.halts = lambda driver: True\n"
+        "realtime.idle_cores_halt = lambda driver: True\n"
         f"held = contextlib.ExitStack(); print(realtime._keep_from_halting({CORES[0]}, held, []))\n"
         "print(*Path(f'/proc/self/task/{os.getpid()}/children').read_text().split(), flush=True)\n"
         "os.kill(os.getpid(), 9)"

@@ -22,7 +22,7 @@ from runs.conftest import written
 from ident_service.cli import main
 from ident_service.config.load import load_arm
 from ident_service.errors import ArmError, ArmFault, MotionRefused
-from ident_service.motion.command_channel import ControlFile, in_use
+from ident_service.motion.command_channel import ControlFile, is_control_file_in_use
 from ident_service.motion.control_loop import LOWERS, WAITS
 from ident_service.operations.motion_run import ProcessResult
 from ident_service.registry.state_folder import control_path, fault_file, ticket_path
@@ -322,7 +322,7 @@ def test_a_held_arm_does_not_fall_with_whoever_requested_the_motion(loose: list[
     with ControlFile.reach(control) as controls:
         wait_for(lambda: controls.waiting, "it is not held")
         time.sleep(1.0)
-        assert in_use(control)
+        assert is_control_file_in_use(control)
         controls.confirm_support()
-    wait_for(lambda: not in_use(control), "it is not let go")
+    wait_for(lambda: not is_control_file_in_use(control), "it is not let go")
     assert list(fault_file(tmp_path / "state", "planar2").latched()) == ["lease_lost"]

@@ -47,7 +47,7 @@ def test_a_parent_that_is_killed_is_gone_at_once(controls: ControlFile, lock_ste
     assert lifeline.lease_ok(0)
     os.kill(parent.pid, signal.SIGKILL)
     parent.wait()
-    assert lifeline.cut
+    assert lifeline.requester_gone
     assert not lifeline.lease_ok(0)
     parent.stdout.close()
 

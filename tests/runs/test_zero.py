@@ -125,7 +125,7 @@ def test_a_ticket_dies_with_the_zero_that_it_was_made_for(config: ArmConfig, beh
     assert set_home(config, state, sure).ticket_removed
     assert not path.exists()
     with make_arm(config) as arm:  # where the file of another state folder was left
-        why = ticket.valid_for(subject_of(arm_model(config), None, arm.describe()), ticket.created)
+        why = ticket.objections_to(subject_of(arm_model(config), None, arm.describe()), ticket.created)
     assert any("not those that were checked" in reason for reason in why), why
 
 

@@ -19,7 +19,7 @@ from ident_service.daemon.jobs.queue import Engine
 from ident_service.daemon.maintenance.reidentification import SERVICE, ReidentificationRequest, Reidentifications
 from ident_service.daemon.maintenance.webhook import Webhook
 from ident_service.errors import IdentError
-from ident_service.motion.command_channel import in_use
+from ident_service.motion.command_channel import is_control_file_in_use
 from ident_service.operations.drift_alarms import alarms
 from ident_service.operations.maintenance_schedule import LATE, mark_due, pending, schedules
 from ident_service.registry.arms import known_arm
@@ -117,7 +117,7 @@ class MaintenanceScheduler:
         if fault_file(self._state, arm).latched():
             return "a fault waits to be acknowledged"
         waiting = any(one["motion"] for one in jobs(self._db, states=LIVE, arm=arm, most=1000))
-        if waiting or in_use(control_path(self._state, arm)):
+        if waiting or is_control_file_in_use(control_path(self._state, arm)):
             return "somebody moves it, or waits to"
         return ""
 

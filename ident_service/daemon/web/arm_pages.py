@@ -41,7 +41,7 @@ from ident_service.daemon.web.forms import Form, PageRoute, see_other
 from ident_service.daemon.web.reidentification_pages import compared
 from ident_service.daemon.web.render import page, picture, when
 from ident_service.errors import IdentError, MotionRefused, UsageError
-from ident_service.motion.command_channel import in_use
+from ident_service.motion.command_channel import is_control_file_in_use
 from ident_service.motion.ticket import Verdict, read_ticket
 from ident_service.operations import maintenance_schedule as planned
 from ident_service.operations.acceptance import Acceptance, acceptances
@@ -313,7 +313,7 @@ def list_arms(service: Serving, who: Viewer) -> Response:
                 "used": used,
                 "accepted": accepted.get(name),
                 "faults": faults,
-                "moving": in_use(control_path(service.state, name)),
+                "moving": is_control_file_in_use(control_path(service.state, name)),
                 "last": last.get(name),
                 "alarms": sum(one["arm"] == name for one in standing),
                 "dues": sum(one["arm"] == name for one in due),
