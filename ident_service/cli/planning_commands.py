@@ -604,11 +604,11 @@ def _add_emulate(verbs: VerbList) -> None:
 
 def _emulate(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.control import Realtime
-    from ident_service.config.load import load_arm, with_sheets
+    from ident_service.config.load import load_arm, with_eds_files
     from ident_service.motion.realtime import temporary_privileges
     from sim_backend.emulator.process import emulate, emulated_buses
 
-    config = with_sheets(load_arm(arguments.arm), arguments.eds)
+    config = with_eds_files(load_arm(arguments.arm), arguments.eds)
     emulated_buses(config)  # refuses before memory is locked, which takes a while
     first = ["set-home", arguments.arm] if config.zeroed_at_home else ["bus", "scan", arguments.arm]
     then = f"; in another terminal: `{command(arguments, first)}`"

@@ -434,7 +434,7 @@ class SafetyMonitor:
         size = np.abs(wanted)
         if (
             all((size <= limit).tolist())
-            and (motors is None or all((motors.used(wanted) <= 1.0).tolist()))
+            and (motors is None or all((motors.torque_shares(wanted) <= 1.0).tolist()))
             and (before is None or all((np.abs(wanted - before) <= self.rate).tolist()))
         ):
             self._sent = wanted
@@ -452,11 +452,11 @@ class SafetyMonitor:
         if over.any():
             what = "a torque of {} {f} was requested, the limit is {}"
             fault = self._found(Check("torque_saturated", over, what, (wanted, limit)))
-        if motors is not None and (over := motors.used(leaves) > 1.0).any():
+        if motors is not None and (over := motors.torque_shares(leaves) > 1.0).any():
             what = "a torque of {} N m was requested, the limit is {}"
             asked = leaves @ motors.to_motors.T
             fault = self._found(Check("torque_saturated", over, what, (asked, motors.torque), motors.names))
-            leaves = motors.limited(leaves)
+            leaves = motors.scaled_within(leaves)
         if before is not None and (fast := np.abs(leaves - before) > self.rate).any():
             change = (leaves - before) / self._period
             what = "the torque was to change by {} {f}/s, {} allowed"
