@@ -178,16 +178,16 @@ class Program:
             output[row][...] = value
 
 
-def operands_of(tape: ExpressionGraph, at: int) -> list[int]:
-    """Return the indices of the earlier steps that a step is computed from; empty for inputs and constants."""
-    operation, a, b = tape.steps[at]
+def operands_of(tape: ExpressionGraph, step: int) -> list[int]:
+    """Return the indices of the earlier steps that the step with this index is computed from; [] for an input."""
+    operation, a, b = tape.steps[step]
     return [] if operation == "input" else [value for value in (a, b) if isinstance(value, int)]
 
 
-def needed_steps(tape: ExpressionGraph, wanted: list[int]) -> list[int]:
-    """Return the indices of all steps that the wanted ones depend on, themselves included, increasing."""
+def needed_steps(tape: ExpressionGraph, results: list[int]) -> list[int]:
+    """Return the indices of all steps that the steps `results` depend on, themselves included, increasing."""
     found: set[int] = set()
-    waiting = list(wanted)
+    waiting = list(results)
     while waiting:
         at = waiting.pop()
         if at not in found:

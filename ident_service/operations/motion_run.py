@@ -46,7 +46,7 @@ from ident_service.excitation.trajectory import FourierPath
 from ident_service.model.appearance import visible_bodies
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import base_parameters
-from ident_service.model.limited_process import own_module
+from ident_service.model.limited_process import module_command
 from ident_service.model.urdf import urdf_text
 from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.command_channel import LEASE_SECONDS, ControlFile
@@ -150,7 +150,7 @@ def supervise_motion_process(
     Raises:
         KeyboardInterrupt: it came before the arm was taken, or the motion process did not end after it.
     """
-    command, environment = own_module("ident_service.motion.process")
+    command, environment = module_command("ident_service.motion.process")
     # A session of its own, so that signals to this process group do not reach it.
     with subprocess.Popen(  # noqa: S603 - our own interpreter and module
         command,
@@ -333,7 +333,7 @@ class TargetMonitor:
 
     def __enter__(self) -> Self:
         """Start the process that follows the recording."""
-        command, environment = own_module("ident_service.operations.target_process")
+        command, environment = module_command("ident_service.operations.target_process")
         self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
             command,
             bufsize=0,
