@@ -162,7 +162,7 @@ def restore(file: Path, state: Path, who: str, *, replace: bool = False) -> Back
         try:
             head, files, size = _extract(file, staging)
             with Database(staging) as db:
-                if not db.sound():
+                if not db.is_intact():
                     raise UsageError(f"{file}: its registry is damaged; use another backup")
                 revoke_first_tokens(db, who)  # whose file stays behind; the next start makes another one
                 note(db, who, "restored", "state folder", created=head["created"], software=head["software"])

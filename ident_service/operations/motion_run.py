@@ -57,7 +57,7 @@ from ident_service.motion.ticket import Ticket, subject_of
 from ident_service.operations.arm_checks import write_ticket
 from ident_service.recordings.files import require_writable
 from ident_service.recordings.recorder import RecorderProcess
-from ident_service.registry.state_folder import arm_folder, fault_file
+from ident_service.registry.state_folder import arm_fault_store, arm_folder
 from ident_service.results.manifest import require_place, write_atomically, write_manifest
 
 _RENEW_SHARE = 0.25  # of the lease
@@ -434,7 +434,7 @@ def run_motion(
         RecordingError: the recording failed, which has stopped the arm.
     """
     requested_ns = time.monotonic_ns() if requested_ns is None else requested_ns
-    faults = fault_file(state, config.name)
+    faults = arm_fault_store(state, config.name)
     faults.require_none(faults.latched())
     if folder.exists():
         raise UsageError(f"{folder}: exists already; give a folder that does not")

@@ -496,7 +496,7 @@ class Engine:
                 row = rows.add_job(
                     *(self.db, job, asked.kind, order.arm, asked.model_dump(mode="json"), list(order.words), by),
                     motion=order.moves,
-                    run=order.run,
+                    run_id=order.run,
                 )
                 note(self.db, by, "job created", job, kind=asked.kind, arm=order.arm)
                 entering(row)
@@ -640,7 +640,7 @@ class Engine:
 
     def _begin(self, live: LiveJob) -> None:
         folder = self.state / JOBS / live.job
-        if not rows.started(self.db, live.job, ""):
+        if not rows.mark_started(self.db, live.job, ""):
             self.live.remove(live)
             return
         if live.end_reason:  # cancelled while the registry was written
@@ -718,7 +718,7 @@ class Engine:
 
     def _finish(self, live: LiveJob, state: str, detail: str, code: int | None) -> None:
         with self.db.transaction():
-            entered = rows.ended(self.db, live.job, state, detail, code)
+            entered = rows.mark_ended(self.db, live.job, state, detail, code)
             if entered:
                 forget_unmade(self.db, self.state, rows.known_job(self.db, live.job))
                 note(self.db, live.by, "job ended", live.job, state=state, detail=detail)
@@ -740,11 +740,11 @@ class Engine:
         from pydantic import TypeAdapter
 
         reader: TypeAdapter[AnyJobRequest] = TypeAdapter(AnyJobRequest)
-        for row in rows.queue(self.db):
+        for row in rows.queued_jobs(self.db):
             try:
                 order = command(self.db, self.state, reader.validate_python(row["request"]))
             except (IdentError, ValueError) as error:
-                rows.ended(self.db, row["id"], "failed", f"it cannot be begun any more: {error}")
+                rows.mark_ended(self.db, row["id"], "failed", f"it cannot be begun any more: {error}")
                 forget_unmade(self.db, self.state, row)
                 continue
             # Its arguments and folder are those that were entered when it was requested.
