@@ -393,11 +393,11 @@ def _require_name(arguments: argparse.Namespace, name: str, what: str) -> None:
 
 
 def _import(arguments: argparse.Namespace) -> Answer:
-    from ident_service.config.load import load_arm, sheet_file
+    from ident_service.config.load import load_arm, read_eds_file
     from ident_service.operations.drive_configuration import drives_document, import_configuration, imported_text
 
     config, dry = load_arm(arguments.arm), arguments.dry_run
-    files = [sheet_file(name) for name in arguments.files]
+    files = [read_eds_file(name) for name in arguments.files]
     if not dry:
         _require_name(arguments, config.name, "drives are configured anew")
     found = import_configuration(config, files, dry=dry)
@@ -459,12 +459,12 @@ def _scan(arguments: argparse.Namespace) -> Answer:
 
 
 def _probe(arguments: argparse.Namespace) -> Answer:
-    from ident_service.config.load import load_arm, sheet_file
+    from ident_service.config.load import load_arm, read_eds_file
     from ident_service.operations.fieldbus import FILE, bus_probe, keep_outcome, probe_document, probe_text
     from ident_service.registry.state_folder import arm_folder
 
     config = load_arm(arguments.arm)
-    found = bus_probe(config, [sheet_file(name) for name in arguments.eds])
+    found = bus_probe(config, [read_eds_file(name) for name in arguments.eds])
     text, document = probe_text(config, found), probe_document(config, found)
     if not arguments.eds:
         path = arm_folder(writable_state_folder(arguments), config.name) / FILE

@@ -90,7 +90,7 @@ def with_eds_files(config: ArmConfig, eds_files: Sequence[str]) -> ArmConfig:
 
     if not is_canopen(config.driver):
         raise UsageError(f"{config.name}: the driver is not CANopen's, so that no data sheet describes its drives")
-    driver, sheets = config.driver, tuple(map(sheet_file, eds_files))
+    driver, sheets = config.driver, tuple(map(read_eds_file, eds_files))
     for sheet in sheets:
         if why := data_sheet(sheet.text).mistake:
             raise UsageError(f"{sheet.name}: not an EDS: {why}")
@@ -98,10 +98,10 @@ def with_eds_files(config: ArmConfig, eds_files: Sequence[str]) -> ArmConfig:
     return config.model_copy(update={"driver": driver.model_copy(update={"emulation": emulation})})
 
 
-def sheet_file(name: str) -> TextFile:
+def read_eds_file(path: str) -> TextFile:
     """Read an EDS or DCF file of any encoding as text; raises UsageError where it cannot be read."""
     try:
-        return TypeAdapter(AnyTextBeside).validate_python(name)
+        return TypeAdapter(AnyTextBeside).validate_python(path)
     except ValidationError as error:
         raise UsageError("; ".join(one["msg"].removeprefix("Value error, ") for one in error.errors())) from None
 

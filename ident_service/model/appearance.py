@@ -108,7 +108,7 @@ def visual_meshes(file: Path, kinematics: Kinematics, chain: Chain) -> list[Mesh
                 continue
             if link.joint is None:
                 raise UsageError(f"{link.where} hangs on joint {link.carrier!r}, which the arm does not have")
-            rotation, translation = link.place(visual)
+            rotation, translation = link.element_pose(visual)
             found = _mesh_file(file, mesh.get("filename", ""), link.where)
             scale = mesh_scale(mesh.get("scale", "1 1 1"), link.where)
             meshes.append(Mesh(link.joint, found, rotation, translation, scale))
@@ -135,7 +135,7 @@ class PlacedLink:
     rotation: Array
     translation: Array
 
-    def place(self, element: ET.Element) -> tuple[Array, Array]:
+    def element_pose(self, element: ET.Element) -> tuple[Array, Array]:
         """Return rotation and translation [m] of a visual or collision element in the joint's frame."""
         rotation, translation = origin_of(element.find("origin"), self.where)
         return self.rotation @ rotation, self.rotation @ translation + self.translation

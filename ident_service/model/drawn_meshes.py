@@ -72,7 +72,7 @@ def _link_triangles(link: PlacedLink, folder: Path) -> list[Array]:
         triangles = mesh_triangles(path, mesh_scale(mesh.get("scale", "1 1 1"), link.where))
         if triangles is None:
             raise UsageError(f"{link.where}: the mesh {name!r} cannot be read")
-        rotation, translation = link.place(part)
+        rotation, translation = link.element_pose(part)
         found.append(triangles @ rotation.T + translation)
     return found
 

@@ -106,7 +106,7 @@ class Information:
         return whole
 
     def squared_residuals(self, beta: Array) -> Array:
-        """Return per joint the sum of squared torque errors of `beta` [N^2 m^2 or N^2], shape (joints,)."""
+        """Return per joint the sum of squared torque errors of base parameters `beta` [N^2 m^2 or N^2], (joints,)."""
         errors = [
             factor[:, -1] - factor[:, :-1] @ beta[support]
             for support, factor in zip(self.supports, self.factors, strict=True)
@@ -132,7 +132,7 @@ class Information:
         return np.array([float(factor[:, -1] @ factor[:, -1]) for factor in self.factors])
 
     def scores(self, beta: Array, weights: Array | None = None) -> Array:
-        """Return the negative gradient of half the squared residual, `W^T (omega - W beta)`, shape (base,).
+        """Return the negative gradient of half the squared residual at base parameters `beta`, `W^T (omega - W beta)`.
 
         Args:
             beta: base parameters, shape (base,).

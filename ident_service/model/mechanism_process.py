@@ -293,10 +293,10 @@ def _document(
     }
 
 
-def main(words: list[str]) -> int:
+def main(arguments: list[str]) -> int:
     """Read one MJCF file, within limits of memory and time, and print its mechanism as JSON; return 0."""
     return print_json_within_limits(
-        MOST_MEMORY, MOST_SECONDS, lambda: mjcf_document(words[0], words[1] if words[1:] else None)
+        MOST_MEMORY, MOST_SECONDS, lambda: mjcf_document(arguments[0], arguments[1] if arguments[1:] else None)
     )
 
 

@@ -800,9 +800,11 @@ def _surface(solid: Any) -> Array | None:
     return _hull(np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]))
 
 
-def main(words: list[str]) -> int:
+def main(arguments: list[str]) -> int:
     """Read the outline of one MJCF, within limits of memory and time, and print it as JSON; return 0."""
-    return print_json_within_limits(_MOST_MEMORY, _MOST_SECONDS, lambda: _mjcf_document(Path(words[0]), Path(words[1])))
+    return print_json_within_limits(
+        _MOST_MEMORY, _MOST_SECONDS, lambda: _mjcf_document(Path(arguments[0]), Path(arguments[1]))
+    )
 
 
 if __name__ == "__main__":

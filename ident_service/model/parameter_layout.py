@@ -211,7 +211,7 @@ def own_drives(chain: Chain) -> NDArray[np.bool_]:
 
 
 def joint_drives(chain: Chain, layout: Layout, delta: Array) -> JointDrives:
-    """Return inertia, damping and dry friction that each joint's own drive adds to it; zero for shared drives.
+    """Return inertia, damping and dry friction, of link parameters `delta`, of each joint's own drive; zero for shared.
 
     Args:
         chain: the mechanism.

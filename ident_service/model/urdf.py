@@ -29,7 +29,7 @@ BASE_LINK = "base_link"
 
 
 def urdf_text(model: ArmModel, delta: Array | None, visible: Sequence[Body] = ()) -> str:
-    """Return the arm as URDF text: kinematics and limits, inertias of `delta`, and solids to draw.
+    """Return the arm as URDF text: kinematics, limits, inertias of link parameters `delta`, if any, solids to draw.
 
     Args:
         model: the mechanism and its limits.

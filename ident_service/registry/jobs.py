@@ -39,7 +39,7 @@ def add_job(
     motion: bool,
     run_id: str | None,
 ) -> Row:
-    """Enter a queued job; return its row."""
+    """Enter a queued job; return its row. `arguments` are the words of its command after `ident`."""
     db.write(
         "INSERT INTO jobs (id, kind, arm, state, motion, request, words, run, created, created_by) "
         "VALUES (?, ?, ?, 'queued', ?, ?, ?, ?, ?, ?)",
@@ -65,7 +65,7 @@ def jobs(
     before: int | None = None,
     most: int = 100,
 ) -> list[Row]:
-    """Return jobs in some states, of an arm if one is named, the newest first."""
+    """Return at most `most` jobs in `states`, of an arm if named, the newest first, below the number `before`."""
     marks = ", ".join("?" * len(states))
     rows = db.rows(
         f"SELECT * FROM jobs WHERE state IN ({marks}) AND (? IS NULL OR arm = ?) AND number < ? "  # noqa: S608 - marks

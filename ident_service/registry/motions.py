@@ -75,7 +75,7 @@ def known_motion(db: Database, motion: str) -> Row:
 
 
 def motions(db: Database, arm: str | None = None, *, before: str | None = None, most: int = 500) -> list[Row]:
-    """Return motions, or those of an arm, the newest first, from the one after the id `before`."""
+    """Return at most `most` motions, of an arm if named, the newest first, from the one older than `before`."""
     return db.newest("motions", "motion", "added", arm, before, most)
 
 

@@ -108,7 +108,7 @@ def known_run(db: Database, run: str) -> Row:
 
 
 def runs(db: Database, arm: str | None = None, *, before: str | None = None, most: int = 100) -> list[Row]:
-    """Return runs, or those of an arm, the newest first, from the one after the id `before`."""
+    """Return at most `most` runs, of an arm if named, the newest first, starting with the one older than `before`."""
     return db.newest("runs", "run", "created", arm, before, most)
 
 

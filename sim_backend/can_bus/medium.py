@@ -157,7 +157,7 @@ class BusEndpoint:
             bytes(any(k & mask == wanted & mask for wanted, mask in chosen) for k in range(0x800)) if chosen else None
         )
 
-    def hear(self, frame: Frame, own: bool = False) -> None:
+    def hear(self, frame: Frame, sent_by_itself: bool = False) -> None:
         """Put a frame into the inbox, with whether it is its own, if it passes the filters and finds room."""
         if self._passes is not None and not frame.error and (frame.extended or not self._passes[frame.identifier]):
             return
@@ -168,7 +168,7 @@ class BusEndpoint:
         if self._overflowed:
             self._overflowed = False
             self.inbox.append((overflow(frame.stamp_ns), False))
-        self.inbox.append((frame, own))
+        self.inbox.append((frame, sent_by_itself))
 
     def take(self) -> list[tuple[Frame, bool]]:
         """Return the received frames, each with whether it was its own, and empty the inbox."""

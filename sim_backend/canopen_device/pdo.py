@@ -91,7 +91,7 @@ def layout(objects: Objects, index: int, count: int | None = None) -> Layout:
 
 
 def check_write(objects: Objects, key: int, value: int) -> None:
-    """Raise SdoAbort where a host may not write this value into a PDO parameter now.
+    """Raise SdoAbort where a host may not write `value` into the PDO parameter `key` (index << 8 | sub-index) now.
 
     A PDO's identifier and mapping only change while it does not exist (bit 31), entries only while there are none.
     Where the identifier is fixed, the number of entries alone says whether it exists.
