@@ -24,7 +24,7 @@ import yaml
 
 from benchmarks.harness import Row, table, write
 from ident_service.config.load import load_arm, shipped_arms
-from ident_service.registry.state_folder import fault_file
+from ident_service.registry.state_folder import arm_fault_store
 
 TRIES = 10
 TARGET = "0.9"
@@ -101,7 +101,7 @@ def measure(path: Path, tries: int, state: Path) -> list[Row]:
         ended: dict[str, Any] = {}
         if (run / "ended.json").is_file():
             ended = json.loads((run / "ended.json").read_text(encoding="utf-8"))
-        faults = fault_file(state, config.name)
+        faults = arm_fault_store(state, config.name)
         ends.update(["done"] if ended.get("state") == "done" else [f"{k}: {v}" for k, v in faults.latched().items()])
         for code in list(faults.latched()):
             _ident("ack", path, code, "--state", state)

@@ -25,7 +25,7 @@ from benchmarks.harness import Row, table, write
 from ident_service.config.load import load_arm
 from ident_service.operations.commissioning import simulate
 from ident_service.registry import jobs
-from ident_service.registry.arms import know_shipped
+from ident_service.registry.arms import register_shipped_arms
 from ident_service.registry.database import Database
 from ident_service.registry.runs import RUNS, index_run
 
@@ -58,7 +58,7 @@ def fill(state: Path, made: Path) -> None:
     """Runs and jobs of a daemon that has served for long; one run was made, the others are its files once more."""
     simulate(load_arm(_ARM), made)
     with Database(state) as db:
-        know_shipped(db)
+        register_shipped_arms(db)
         for k in range(RUNS_KEPT):
             run = f"{_ARM}-20250101-{k:06d}"
             place = state / RUNS / run
@@ -73,9 +73,9 @@ def fill(state: Path, made: Path) -> None:
         for k in range(JOBS_KEPT):
             job, run = f"job-{k:06d}", f"{_ARM}-20250101-{k % RUNS_KEPT:06d}"
             kind = "simulate" if k < RUNS_KEPT else "report"
-            jobs.add_job(db, job, kind, _ARM, {"kind": kind}, [kind, _ARM], "owner", motion=False, run=run)
-            jobs.started(db, job, "")
-            jobs.ended(db, job, "done", "", 0)
+            jobs.add_job(db, job, kind, _ARM, {"kind": kind}, [kind, _ARM], "owner", motion=False, run_id=run)
+            jobs.mark_started(db, job, "")
+            jobs.mark_ended(db, job, "done", "", 0)
 
 
 def first_page(state: Path, page: str) -> float:

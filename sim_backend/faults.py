@@ -122,29 +122,29 @@ class Feedback:
         self.lost = 0
 
     def receive(
-        self, fresh: Vector, status: tuple[int, ...], faults: Sequence[Fault]
+        self, measured_position: Vector, status: tuple[int, ...], faults: Sequence[Fault]
     ) -> tuple[Vector, Flags, Counts, tuple[int, ...]]:
         """Return positions, validity, ages and status words of a cycle as its faults show them, and remember them.
 
         Args:
-            fresh: positions that the encoders show [rad or m], shape (joints,); kept.
+            measured_position: positions that the encoders show [rad or m], shape (joints,); kept.
             status: status words of the drives, per axis.
             faults: active faults.
 
         Returns:
             Positions, validity, age and status words as a sample holds them, arrays new and of shape (joints,).
         """
-        self._history.append(fresh)
-        answered = np.ones(fresh.shape, dtype=bool)
+        self._history.append(measured_position)
+        answered = np.ones(measured_position.shape, dtype=bool)
         if not faults:
             self._age = np.zeros_like(self._age)
-            self._last, self._status = fresh, status
-            return fresh.copy(), answered, self._age.copy(), status
-        shown, delayed = fresh.copy(), np.zeros_like(self._age)
+            self._last, self._status = measured_position, status
+            return measured_position.copy(), answered, self._age.copy(), status
+        shown, delayed = measured_position.copy(), np.zeros_like(self._age)
         for fault in faults:
             if (effect := _SHOWN.get(fault.kind)) is None:
                 continue
-            axes, old = fault.axes, fresh
+            axes, old = fault.axes, measured_position
             if fault.kind in (FaultKind.DELAYED_FEEDBACK, FaultKind.HIDDEN_DELAY):
                 cycles = min(round(fault.size / self._period), len(self._history) - 1)
                 old = self._history[-1 - cycles]

@@ -220,7 +220,7 @@ class Drives:
             `acting`.
         """
         if torque is not None:
-            self._command = read_only(self._imperfections.drive(torque))
+            self._command = read_only(self._imperfections.quantize_torque(torque))
         self._silent = self._silent + 1 if torque is None and self.on else 0
         self._queue.append(self._command)
         self._wanted = self._queue.popleft()
@@ -476,7 +476,7 @@ class SimulatedHardware:
         acting = self._drives.latch(torque, faults)
         if torque is not None:
             self.supported = False
-        fresh = self.imperfections.encode(self.plant.position)
+        fresh = self.imperfections.quantize_position(self.plant.position)
         position, valid, age, status = self._feedback.receive(fresh, self._drives.status, faults)
         return Reading(position, acting, valid, age, self._feedback.lost, status, int(age.max()))
 
@@ -491,7 +491,7 @@ class SimulatedHardware:
             DriverError: the plant ran away; it stays where it was.
         """
         if not self.supported:
-            self.plant.brake(
+            self.plant.set_braking(
                 self.stand.damping if self.stand and self._has_sunk_onto_support(self.stand) else self._drives.damping
             )
             self.plant.step(self._drives.output())
@@ -513,7 +513,7 @@ class SimulatedHardware:
         faults = active_faults(self.faults, self.tick)
         self.tick += 1
         loads = [fault for fault in faults if fault.kind is FaultKind.LOAD_ATTACHED]
-        self.plant.load(tuple((fault.size, fault.offset) for fault in loads))
+        self.plant.attach_loads(tuple((fault.size, fault.offset) for fault in loads))
         return faults
 
 
@@ -536,7 +536,7 @@ def checked_torque(torque: Vector | None, enabled: bool, joints: int) -> Vector 
 
 
 def description(machine: SimulatedHardware) -> ArmDescription:
-    """Return the description of a simulated arm: joints, rate, limits, resolutions, watchdog and delay."""
+    """Return the description of a simulated arm: joints, rate, torque limits, resolutions, watchdog and delay."""
     names = machine.plant.chain.names
     return ArmDescription(
         joint_names=names,

@@ -45,26 +45,26 @@ _SWEEPS = 20
 _ROUNDS = 500
 
 
-def stick_slip_velocity(A: Vector, b: Vector, bound: Vector, guess: Vector) -> Vector:
-    """Solve A v + friction = b for v, with dry friction up to `bound`; joints that stick come back with exactly 0.
+def stick_slip_velocity(A: Vector, b: Vector, friction_bound: Vector, guess: Vector) -> Vector:
+    """Solve A v + friction = b for v, dry friction at most `friction_bound`; v is exactly 0 for joints that stick.
 
     Args:
         A: symmetric positive definite, shape (joints, joints).
         b: shape (joints,).
-        bound: largest friction in the units of b, not negative, shape (joints,).
+        friction_bound: largest friction in the units of b, not negative, shape (joints,).
         guess: a velocity whose signs are probably right, 0 for joints that probably stick, shape (joints,).
 
     Returns:
         The velocities, shape (joints,).
     """
-    slack = _EDGE * float((np.abs(b) + bound).max())
-    v, consistent = _pivot(A, b, bound, np.sign(guess), slack)
+    slack = _EDGE * float((np.abs(b) + friction_bound).max())
+    v, consistent = _pivot(A, b, friction_bound, np.sign(guess), slack)
     if consistent:
         return v
     # Pivoting several joints at once can go in circles; sweeping over them one by one only ever descends.
     for _ in range(_ROUNDS):
-        v = _sweep(A, b, bound, v)
-        exact, consistent = _pivot(A, b, bound, np.sign(v), slack, pivots=1)
+        v = _sweep(A, b, friction_bound, v)
+        exact, consistent = _pivot(A, b, friction_bound, np.sign(v), slack, pivots=1)
         if consistent:
             return exact
     return v
@@ -144,11 +144,11 @@ class Imperfections:
         """Return the imperfections of a perfect arm: continuous, without noise, unlimited."""
         return cls(np.zeros(joints), np.zeros(joints), np.zeros(joints), np.full(joints, np.inf))
 
-    def encode(self, position: Vector) -> Vector:
+    def quantize_position(self, position: Vector) -> Vector:
         """Return the position in whole encoder steps, a new array of shape (joints,)."""
         return _in_steps(position, self._encoder_steps)
 
-    def drive(self, torque: Vector) -> Vector:
+    def quantize_torque(self, torque: Vector) -> Vector:
         """Return the torque in the drives' steps, within their limits, a new array of shape (joints,)."""
         least, most = self._range
         return np.asarray(np.minimum(np.maximum(_in_steps(torque, self._torque_steps), least), most))
@@ -275,7 +275,7 @@ class Plant:
         """Return the objects that a step depends on besides torque and period, to be compared by identity."""
         return self._position, self._velocity, self._acceleration, self._braking, self._loads
 
-    def brake(self, damping: Array) -> None:
+    def set_braking(self, damping: Array) -> None:
         """Set the viscous friction that brakes every step from now on, in place of that set before.
 
         Args:
@@ -297,24 +297,24 @@ class Plant:
             position: [rad or m], shape (joints,).
         """
         still = np.zeros(self._chain.joints)
-        self.take(_read_only(np.array(position, dtype=float), still, still, still))
+        self.set_state(_read_only(np.array(position, dtype=float), still, still, still))
 
-    def load(self, loads: tuple[Load, ...]) -> None:
+    def attach_loads(self, point_masses: tuple[Load, ...]) -> None:
         """Attach point masses to the last link, in place of those attached before.
 
         Args:
-            loads: mass [kg] and offset in the frame of the last link [m] of each.
+            point_masses: mass [kg] and offset in the frame of the last link [m] of each.
         """
-        if loads == self._loads:
+        if point_masses == self._loads:
             return
         delta = self._delta.copy()
         inertial = delta[self._layout.inertial(self._chain.joints - 1)]  # a view
-        for mass, offset in loads:
+        for mass, offset in point_masses:
             x, y, z = offset
             inertial[:6] += mass * np.array([y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y])
             inertial[6:9] += mass * np.array(offset)
             inertial[9] += mass
-        self._loads = loads
+        self._loads = point_masses
         self._build(delta)
 
     def step(self, torque: Array, period: float | None = None) -> None:
@@ -327,13 +327,13 @@ class Plant:
         Raises:
             DriverError: the state is no longer finite; it stays what it was before the step.
         """
-        self.take(self.after(torque, period))
+        self.set_state(self.state_after(torque, period))
 
-    def take(self, state: PlantState) -> None:
-        """Set the plant to a state that `after` has returned."""
+    def set_state(self, state: PlantState) -> None:
+        """Set the plant to a state that `state_after` has returned."""
         self._position, self._velocity, self._acceleration, self._rate = state
 
-    def after(self, torque: Array, period: float | None = None) -> PlantState:
+    def state_after(self, torque: Array, period: float | None = None) -> PlantState:
         """Return the state to which `step` would lead, and leave the plant where it is."""
         h = self._period if period is None else period
         if h != self._stepped:

@@ -61,13 +61,13 @@ class PlantStatistics:
         self._silent_velocity, self._silent_torque = np.zeros(joints), np.zeros(joints)
         self.write()
 
-    def serve(self, pid: int) -> None:
+    def client_came(self, pid: int) -> None:
         """Record that a client with this pid has connected, and enter SERVING."""
         self._clients, self._client_pid = self._clients + 1, pid
-        self.heard()
+        self.frame_came()
         self.enter(PlantState.SERVING)
 
-    def settle(self) -> None:
+    def client_left(self) -> None:
         """Record that the client is gone: enter AT_REST where the arm is supported, else SETTLING."""
         self._client_pid = 0
         self.enter(PlantState.AT_REST if self._machine.supported else PlantState.SETTLING)
@@ -83,14 +83,14 @@ class PlantStatistics:
         resting = self.state is PlantState.AT_REST or self._machine.supported
         self.enter(PlantState.ENDED_AT_REST if resting else PlantState.ENDED_MOVING)
 
-    def heard(self) -> None:
+    def frame_came(self) -> None:
         """Record that a frame has come; silence is counted from here."""
         if self.silent_ticks:
             self.silent_ticks = 0
         self._silent_velocity[:] = 0.0
         self._silent_torque[:] = 0.0
 
-    def moved(self, *, silent: bool) -> None:
+    def period_ended(self, *, silent: bool) -> None:
         """Record the extremes of a period that is over, as silent if no frame came; write them now and then."""
         plant = self._machine.plant
         speed, torque = np.abs(plant.velocity), np.abs(self._machine.torque)
@@ -255,7 +255,7 @@ class PlantProcess:
         self._machine.restart()
         self._begun, self._error = False, None
         self._next_ns = time.monotonic_ns()
-        self._story.serve(pid)
+        self._story.client_came(pid)
 
     def _serve(self) -> None:
         """Serve one request of the client; its end, or a malformed frame, ends the connection."""
@@ -272,7 +272,7 @@ class PlantProcess:
             client.close()
             self._client, self._client_pid = None, 0
             self._quiet = self._abandoned = 0
-            self._story.settle()
+            self._story.client_left()
         else:
             if isinstance(request, wire.Exchange):
                 self._advance()
@@ -293,7 +293,7 @@ class PlantProcess:
         except wire.MalformedFrame:
             raise
         except DriverError as error:
-            return wire.failed(error)
+            return wire.failure_of(error)
         return wire.Done()
 
     def _cycle(self, request: wire.Exchange) -> wire.Reply:
@@ -313,7 +313,7 @@ class PlantProcess:
             raise DriverError("a torque for an arm that is not enabled")
         reading = machine.cycle(request.torque if request.sends else None)
         truth = machine.truth(self._next_ns)
-        self._story.heard()
+        self._story.frame_came()
         return wire.Answer(
             self._next_ns,
             reading.lost,
@@ -358,7 +358,7 @@ class PlantProcess:
         except DriverError as error:
             self._error = error
         self._next_ns += self._period_ns
-        self._story.moved(silent=silent)
+        self._story.period_ended(silent=silent)
 
 
 def start_document(

@@ -157,12 +157,12 @@ class MalformedFrame(DriverError):
     """Report bytes that are not a frame; the connection to their sender is closed."""
 
 
-def encode(frame: Request | Reply, number: int, joints: int) -> bytes:
+def encode(frame: Request | Reply, request_number: int, joints: int) -> bytes:
     """Encode a request or a reply as bytes, with the low 32 bits of its number.
 
     Args:
         frame: frame with arrays of shape (joints,).
-        number: number of the request that the frame is or answers.
+        request_number: number of the request that the frame is or answers.
         joints: of the arm.
     """
     kind, fields = _KINDS[type(frame)]
@@ -175,7 +175,7 @@ def encode(frame: Request | Reply, number: int, joints: int) -> bytes:
             values += value.tolist() if isinstance(value, np.ndarray) else value
     body = _body(kind, joints)
     per_joint = joints if any(each for _, each in fields) else 0
-    return _HEADER.pack(MAGIC, VERSION, kind, per_joint, number & 0xFFFFFFFF) + body.pack(*values)
+    return _HEADER.pack(MAGIC, VERSION, kind, per_joint, request_number & 0xFFFFFFFF) + body.pack(*values)
 
 
 def decode_request(data: bytes, joints: int) -> tuple[int, Request]:
@@ -248,6 +248,6 @@ def text_of(failed: Failed) -> str:
     return failed.text.rstrip(b"\0").decode("utf-8", errors="replace")
 
 
-def failed(error: Exception) -> Failed:
+def failure_of(error: Exception) -> Failed:
     """Create the reply that reports an error, its text cut to the frame's length."""
     return Failed(str(error).encode()[:_TEXT])

@@ -143,7 +143,7 @@ def _remedies(driver: CanopenDriver, rate: float, plain: Budget) -> Iterator[str
 
 
 def _variants(driver: CanopenDriver) -> Iterator[tuple[str, CanopenDriver]]:
-    if driver.torque_frames == "single" and driver.streams == "torque" and driver.shares_by_sheet:
+    if driver.torque_frames == "single" and driver.streams == "torque" and driver.sheets_allow_short_dummies:
         words = "let up to four drives share a torque frame (driver.torque_frames: shared)"
         yield words, driver.model_copy(update={"torque_frames": "shared"})
     if len(driver.buses) == 1 and len(driver.drives) > 1:

@@ -24,7 +24,7 @@ from ident_service.config.drive_family import (
     TorqueLimit,
     TorquePath,
     TorqueUnit,
-    family_from,
+    parse_family,
 )
 from ident_service.config.eds import DataSheet
 from ident_service.errors import DriverError, UnsuitableDrive
@@ -37,7 +37,7 @@ GENERIC = "generic402"
 def shipped_families() -> tuple[Family, ...]:
     """Return the families that come with the driver, the generic one last."""
     files = sorted(_FOLDER.glob("*.yaml"), key=lambda path: (path.stem == GENERIC, path.stem))
-    return tuple(family_from(path.name, path.read_text(encoding="utf-8")) for path in files)
+    return tuple(parse_family(path.name, path.read_text(encoding="utf-8")) for path in files)
 
 
 def family_of(identity: Mapping[str, int], own_families: Sequence[Family] = ()) -> Family:
@@ -52,7 +52,7 @@ def family_of(identity: Mapping[str, int], own_families: Sequence[Family] = ()) 
     makers = [one for one in (*own_families, *shipped) if one.match.vendor is not None and one.match.vendor == vendor]
     exact = [one for one in makers if product in one.match.product]
     found = [*exact, *(one for one in makers if not one.match.product)]
-    return found[0].over(generic) if found else generic
+    return found[0].completed_by(generic) if found else generic
 
 
 def parse_entry(text: str, name: str, unit: str = "") -> Entry:
@@ -472,8 +472,8 @@ def _other_limits(
     most = 1000.0 * drive.max_torque / drive.rated_torque
     for limit in family.torque_limit:
         held = None if limit is chosen or limit.per else found.get(parse_entry(limit.entry, ""))
-        if held is not None and limit.held(held) < most:
-            share = limit.held(held) * drive.rated_torque / 1000.0
+        if held is not None and limit.entry_or_limit(held) < most:
+            share = limit.entry_or_limit(held) * drive.rated_torque / 1000.0
             yield f"{readable_entry(limit.entry)} is {held}: it may keep to {share:.4g} N m, below drives.max_torque"
 
 
@@ -491,14 +491,14 @@ def _count(family: Family, found: DriveEntries, drive: CanopenDrive) -> float | 
 
 def torque_unit_size(unit: TorqueUnit, drive: CanopenDrive) -> float:
     """Return the size of one unit of a torque [N m]; factors that the description lacks count as 1."""
-    constant = drive.torque_constant or 1.0 if unit.of_current else 1.0
+    constant = drive.torque_constant or 1.0 if unit.counts_are_current else 1.0
     return TORQUE_UNITS[unit.unit] * constant * (drive.current_unit or 1.0 if unit.unit == "own" else 1.0)
 
 
 def _unknown(unit: TorqueUnit, drive: CanopenDrive) -> Iterator[Problem]:
     """Tell what a description lacks to convert counts of a current to torques."""
     of = "a count" if unit.rated is None else readable_entry(unit.rated)
-    if unit.of_current and drive.torque_constant is None:
+    if unit.counts_are_current and drive.torque_constant is None:
         yield Problem("drives.torque_constant", f"{of} is of a current: give it [N m/A]")
     if unit.unit == "own" and drive.current_unit is None:
         yield Problem("drives.current_unit", f"{of} is in the drive's own unit of current: give it [A]")
@@ -529,7 +529,7 @@ def _unit_changes(family: Family, found: DriveEntries, drive: CanopenDrive, coun
         words = f"{drive.max_torque:g} N m are {drive.max_torque / thousand:.3g} times what a thousand counts are"
         yield Problem("drives.max_torque", f"{words}, more than any drive gives; is it of the motor, in N m?")
     current = found.get(od.RATED_CURRENT)
-    if not unit.of_current and current and drive.torque_constant is not None:
+    if not unit.counts_are_current and current and drive.torque_constant is not None:
         by_current = 1e-3 * current * drive.torque_constant
         if factor := _factor(thousand, by_current, _ABSURD - 1.0):
             words = f"with 6075h it makes {by_current:g} N m, but a thousand counts are {thousand:g} N m{factor}"

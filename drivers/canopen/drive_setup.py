@@ -457,7 +457,7 @@ def _largest_torque(objects: Objects, setup: DriveConfiguration) -> None:
     for text in (limit.entry, limit.negative):
         try:
             if text is not None:
-                objects.ensure(Write(parse_entry(text, "largest torque"), limit.held(value)))
+                objects.ensure(Write(parse_entry(text, "largest torque"), limit.entry_or_limit(value)))
         except SdoRefused as refused:
             words = f"drives.max_torque is {setup.drive.max_torque:g} N m"
             raise SdoRefused(

@@ -278,7 +278,7 @@ def bus_profiles(driver: CanopenDriver, rate: float) -> list[BusProfile]:
 
 def _profile(driver: CanopenDriver, rate: float, number: int, bus: CanBus) -> BusProfile:
     drives = [k for k, drive in enumerate(driver.drives) if drive.bus == number]
-    slots, target = driver.drives_a_frame, od.TARGET_POSITION if driver.streams == "position" else od.TARGET_TORQUE
+    slots, target = driver.drives_per_frame, od.TARGET_POSITION if driver.streams == "position" else od.TARGET_TORQUE
     status = (od.STATUS_WORD, od.TORQUE_ACTUAL) if driver.torque_reports == "status" else (od.STATUS_WORD,)
     measured = (od.TORQUE_ACTUAL,) if driver.torque_reports == "cyclic" else ()
     own = driver.status_frame == "own"

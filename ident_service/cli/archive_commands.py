@@ -60,13 +60,13 @@ def registry(arguments: argparse.Namespace, *, arms: bool = True) -> Iterator[tu
         arguments: of the verb.
         arms: whether it is about arms, so that shipped ones are entered.
     """
-    from ident_service.registry.arms import know_shipped
+    from ident_service.registry.arms import register_shipped_arms
     from ident_service.registry.database import Database
 
     state = writable_state_folder(arguments)
     with Database(state) as db:
         if arms:
-            know_shipped(db)
+            register_shipped_arms(db)
         yield db, state
 
 

@@ -132,9 +132,9 @@ def _jobs(state: Path, client: Any, _: argparse.Namespace) -> list[str]:
 def _faults(state: Path, client: Any, parsed: argparse.Namespace) -> list[str]:
     if client is not None:
         return [row["code"] for row in client.get(f"/api/v1/arms/{parsed.arm}/faults")]
-    from ident_service.registry.state_folder import fault_file
+    from ident_service.registry.state_folder import arm_fault_store
 
-    return list(fault_file(state, str(parsed.arm)).latched())
+    return list(arm_fault_store(state, str(parsed.arm)).latched())
 
 
 def _ids(client: Any, kind: str) -> list[str]:

@@ -220,9 +220,9 @@ def run_and_report(
 
 def _add_facts(error: IdentError, folder: Path, state: Path, arm: str) -> None:
     """Add to an error the faults, recording and files that the run has left."""
-    from ident_service.registry.state_folder import fault_file
+    from ident_service.registry.state_folder import arm_fault_store
 
-    faults = [{"code": code, "cause": cause} for code, cause in fault_file(state, arm).latched().items()]
+    faults = [{"code": code, "cause": cause} for code, cause in arm_fault_store(state, arm).latched().items()]
     files = _files(folder)
     recorded = next((str(folder / name) for name in ("run.mcap", "run.mcap.partial") if name in files), None)
     if recorded is not None:
@@ -253,9 +253,9 @@ def described_arm(arguments: argparse.Namespace) -> ArmConfig:
     try:
         return load_arm(arguments.arm)
     except UsageError:
-        from ident_service.registry.arms import uploaded_description
+        from ident_service.registry.arms import uploaded_description_file
 
-        path = uploaded_description(state_folder(arguments), str(arguments.arm))
+        path = uploaded_description_file(state_folder(arguments), str(arguments.arm))
         if path is None:
             raise
         return load_arm(path)
@@ -504,7 +504,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.arm_checks import ticket_text, write_ticket
     from ident_service.preflight.preflight import preflight
     from ident_service.recordings.files import require_writable
-    from ident_service.registry.state_folder import arm_folder, control_path, fault_file, ticket_path
+    from ident_service.registry.state_folder import arm_fault_store, arm_folder, control_path, ticket_path
 
     config = described_arm(arguments)
 
@@ -514,7 +514,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
         raise UsageError("give a motion or --home, not both")
     motion = None if arguments.home else _chosen(config, arguments.motion)
     state = writable_state_folder(arguments)
-    path, faults = ticket_path(state, config.name), fault_file(state, config.name)
+    path, faults = ticket_path(state, config.name), arm_fault_store(state, config.name)
     faults.require_none(faults.latched())
     if arguments.confirm not in (None, config.name):
         raise UsageError(f"--confirm {arguments.confirm}: the arm is {config.name}; nothing has moved")
@@ -728,10 +728,10 @@ def _release_drives(arguments: argparse.Namespace) -> Answer:
 
 
 def _ack(arguments: argparse.Namespace) -> Answer:
-    from ident_service.registry.state_folder import fault_file
+    from ident_service.registry.state_folder import arm_fault_store
 
     name = _name(arguments)
-    cause = fault_file(writable_state_folder(arguments), name).acknowledge(arguments.fault)
+    cause = arm_fault_store(writable_state_folder(arguments), name).acknowledge(arguments.fault)
     write_audit_entry(arguments, "fault acknowledged", name, code=arguments.fault, cause=cause)
     return DONE, f"{name}: acknowledged {arguments.fault} ({cause})\n", {"arm": name, "acknowledged": arguments.fault}
 

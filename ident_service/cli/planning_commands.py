@@ -393,11 +393,11 @@ def _require_name(arguments: argparse.Namespace, name: str, what: str) -> None:
 
 
 def _import(arguments: argparse.Namespace) -> Answer:
-    from ident_service.config.load import load_arm, sheet_file
+    from ident_service.config.load import load_arm, read_eds_file
     from ident_service.operations.drive_configuration import drives_document, import_configuration, imported_text
 
     config, dry = load_arm(arguments.arm), arguments.dry_run
-    files = [sheet_file(name) for name in arguments.files]
+    files = [read_eds_file(name) for name in arguments.files]
     if not dry:
         _require_name(arguments, config.name, "drives are configured anew")
     found = import_configuration(config, files, dry=dry)
@@ -459,12 +459,12 @@ def _scan(arguments: argparse.Namespace) -> Answer:
 
 
 def _probe(arguments: argparse.Namespace) -> Answer:
-    from ident_service.config.load import load_arm, sheet_file
+    from ident_service.config.load import load_arm, read_eds_file
     from ident_service.operations.fieldbus import FILE, bus_probe, probe_document, probe_text, store_probe_outcome
     from ident_service.registry.state_folder import arm_folder
 
     config = load_arm(arguments.arm)
-    found = bus_probe(config, [sheet_file(name) for name in arguments.eds])
+    found = bus_probe(config, [read_eds_file(name) for name in arguments.eds])
     text, document = probe_text(config, found), probe_document(config, found)
     if not arguments.eds:
         path = arm_folder(writable_state_folder(arguments), config.name) / FILE
@@ -605,11 +605,11 @@ def _add_emulate(verbs: VerbList) -> None:
 
 def _emulate(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.control import Realtime
-    from ident_service.config.load import load_arm, with_sheets
+    from ident_service.config.load import load_arm, with_eds_files
     from ident_service.motion.realtime import temporary_privileges
     from sim_backend.emulator.process import emulate, emulated_buses
 
-    config = with_sheets(load_arm(arguments.arm), arguments.eds)
+    config = with_eds_files(load_arm(arguments.arm), arguments.eds)
     emulated_buses(config)  # refuses before memory is locked, which takes a while
     first = ["set-home", arguments.arm] if config.zeroed_at_home else ["bus", "scan", arguments.arm]
     then = f"; in another terminal: `{shell_line(arguments, first)}`"

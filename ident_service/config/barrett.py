@@ -188,7 +188,7 @@ def disagreements(
     transmission: Transmission | None,
     joints: Sequence[str],
     rate: float,
-    homeless: Sequence[str] = (),
+    joints_without_home: Sequence[str] = (),
 ) -> Iterator[tuple[tuple[str | int, ...], str]]:
     """Yield (key path, message) for each contradiction of section `driver` with joints, homes, gears or rate.
 
@@ -197,13 +197,13 @@ def disagreements(
         transmission: the arm's.
         joints: names of the arm's joints; none where the file does not name them.
         rate: cycles per second.
-        homeless: names of joints without a `home`.
+        joints_without_home: names of joints without a `home`.
     """
-    if homeless:
+    if joints_without_home:
         yield (
             ("driver",),
             "pucks count from where they were when power came, and need every joint's home, the posture in which a "
-            "person zeroes the arm; missing: " + ", ".join(f"joints.{name}.home" for name in homeless),
+            "person zeroes the arm; missing: " + ", ".join(f"joints.{name}.home" for name in joints_without_home),
         )
     if driver.heartbeat * rate < _LEAST_HEARTBEAT:
         yield (

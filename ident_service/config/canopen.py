@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from ident_service.config.can_bus import CanBus
-from ident_service.config.drive_family import Family, family_from
+from ident_service.config.drive_family import Family, parse_family
 from ident_service.config.eds import DataSheet, data_sheet
 from ident_service.config.quantities import (
     AnyTextBeside,
@@ -317,19 +317,19 @@ class CanopenDriver(ExtendedSection):
         """Return the parsed data sheet (EDS) of each drive, in the order of `drives`."""
         return tuple(data_sheet(self.sheet_file(number).text) for number in range(len(self.drives)))
 
-    def sheet_file(self, number: int) -> TextFile:
+    def sheet_file(self, drive_index: int) -> TextFile:
         """Return the data sheet's file of the drive with this index: its own `eds`, or the one common to all."""
-        return self.drives[number].eds or self.eds
+        return self.drives[drive_index].eds or self.eds
 
     @property
-    def shares_by_sheet(self) -> bool:
+    def sheets_allow_short_dummies(self) -> bool:
         """Return whether each drive's EDS allows dummies of 8 or 16 bits (DummyUsage), for shared torque frames."""
         return all(sheet.dummies & _DUMMIES for sheet in self.sheets)
 
     @property
     def families(self) -> tuple[Family, ...]:
         """Return the drive families that `profiles` add; raises DriverError for a file that describes none."""
-        return tuple(family_from(one.name, one.text) for one in self.profiles)
+        return tuple(parse_family(one.name, one.text) for one in self.profiles)
 
     @property
     def torque_reports(self) -> Literal["cyclic", "status", "none"]:
@@ -349,7 +349,7 @@ class CanopenDriver(ExtendedSection):
         return "position" if lacking else "own"
 
     @property
-    def drives_a_frame(self) -> int:
+    def drives_per_frame(self) -> int:
         """Return the largest number of drives per frame of targets: 4, or 1 for 32-bit targets and `single` frames.
 
         Four torques of 16 bits share a frame. Two of 32 bits would fit, but no dummies do.
@@ -465,7 +465,7 @@ def disagreements(
     transmission: Transmission | None,
     joints: Sequence[str],
     rate: float,
-    homeless: Sequence[str] = (),
+    joints_without_home: Sequence[str] = (),
     velocities: Sequence[float | None] = (),
     torques: Sequence[float | None] = (),
 ) -> Iterator[tuple[tuple[str | int, ...], str]]:
@@ -476,16 +476,16 @@ def disagreements(
         transmission: the arm's.
         joints: names of the arm's joints; none where the file does not name them.
         rate: cycles per second.
-        homeless: names of joints without a `home`.
+        joints_without_home: names of joints without a `home`.
         velocities: velocity limits of the joints [rad/s or m/s], None where one has no limit; none where the file names
             no joints.
         torques: torque limits of the joints [N m or N], likewise.
     """
-    if driver.zero == "at_home" and homeless:
+    if driver.zero == "at_home" and joints_without_home:
         yield (
             ("driver", "zero"),
             "driver.zero: at_home needs every joint's home, the posture in which a person zeroes the arm; missing: "
-            + ", ".join(f"joints.{name}.home" for name in homeless),
+            + ", ".join(f"joints.{name}.home" for name in joints_without_home),
         )
     if driver.reactions.abort_connection == 0 and any(drive.watchdog in ABORTING for drive in driver.drives):
         yield (
@@ -530,12 +530,12 @@ def disagreements(
                     f" joints.{joints[k]}.torque is {limit:g}: {ratio:.3g} times apart, which is another unit or gear",
                 )
     yield from _positions(driver, rate)
-    shares = driver.drives_a_frame > 1 and any(
+    shares = driver.drives_per_frame > 1 and any(
         sum(drive.bus == bus for drive in driver.drives) > 1 for bus in range(len(driver.buses))
     )
     if why := data_sheet(driver.eds.text).mistake:
         yield ("driver", "eds"), f"driver.eds: {driver.eds.name} is not an EDS (CiA 306): {why}; take the drive maker's"
-    elif shares and not driver.shares_by_sheet:
+    elif shares and not driver.sheets_allow_short_dummies:
         yield (
             ("driver", "eds"),
             f"driver.eds: {driver.eds.name} has no Dummy0003=1 under [DummyUsage], nor another dummy of 8 or 16"

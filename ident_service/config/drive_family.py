@@ -93,12 +93,12 @@ class TorqueUnit(Section):
     def _require_rated_or_count(self) -> TorqueUnit:
         if (self.rated is None) == (self.count is None):
             raise ValueError("either `rated` names an entry, or `count` is a number")
-        if self.writable and (self.rated is None or self.of_current):
+        if self.writable and (self.rated is None or self.counts_are_current):
             raise ValueError("only a rated torque in mNm, uNm or cNm is written")
         return self
 
     @property
-    def of_current(self) -> bool:
+    def counts_are_current(self) -> bool:
         """Return whether the drive's torque counts are counts of motor current: `unit` is `mA` or `own`."""
         return self.unit in ("mA", "own")
 
@@ -114,8 +114,8 @@ class TorqueLimit(Section):
     negative: EntryText | None = None
     below: Annotated[int, Field(strict=True, ge=1)] | None = None
 
-    def held(self, counts: int) -> int:
-        """Return the entry's number for a limit [counts], or back: the same, or `below` less it if set, at least 0."""
+    def entry_or_limit(self, counts: int) -> int:
+        """Convert a limit [counts] to the entry's value, or back: the same, or `below` less it if set, at least 0."""
         return counts if self.below is None else max(self.below - counts, 0)
 
 
@@ -161,16 +161,16 @@ class Family(Section):
             raise ValueError(f"sources are needed for {', '.join(sorted(given))}; there are {', '.join(self.sources)}")
         return self
 
-    def over(self, generic: Family) -> Family:
+    def completed_by(self, generic: Family) -> Family:
         """Return a copy of `generic` in which the keys that this family's file sets replace its own."""
         return generic.model_copy(update={key: getattr(self, key) for key in self.model_fields_set})
 
 
-def family_from(name: str, text: str) -> Family:
+def parse_family(file_name: str, text: str) -> Family:
     """Read the description of a drive family from YAML text; raises DriverError if it does not fit the schema.
 
     Args:
-        name: of the file.
+        file_name: of the file.
         text: content of the file, as YAML.
 
     Raises:
@@ -182,4 +182,4 @@ def family_from(name: str, text: str) -> Family:
         content: Any = yaml.safe_load(text)
         return Family.model_validate(content)
     except (yaml.YAMLError, ValidationError, RecursionError) as error:
-        raise DriverError(f"{name} is no family of drives: {error}") from None
+        raise DriverError(f"{file_name} is no family of drives: {error}") from None

@@ -73,15 +73,15 @@ class DataSheetEntry:
         """Return whether a host may read the entry: its access type is not `wo`; True for an unknown one."""
         return self.access != "wo"
 
-    def number(self, node: int) -> int | None:
+    def number(self, node_id: int) -> int | None:
         """Return the entry's value as a number in any notation that makers use; None where it is empty or unreadable.
 
         Args:
-            node: node number that COB-IDs are relative to.
+            node_id: node number that COB-IDs are relative to.
         """
-        return None if self.text is None else _number(self.text, node)
+        return None if self.text is None else _number(self.text, node_id)
 
-    def standard_number(self, node: int) -> int | None:
+    def standard_number(self, node_id: int) -> int | None:
         """Return the entry's value if in a notation of CiA 306-1 (10, 017, 0xA, $NODEID+0xA); None for others.
 
         What is written otherwise has no certain meaning: is 1e5 a hundred thousand, or 485?
@@ -92,7 +92,7 @@ class DataSheetEntry:
         digits = "".join((match["more"] or match["plain"] or "0").split()).lower()
         plain = digits.lstrip("+-")
         base = 16 if plain.startswith("0x") else 8 if plain.startswith("0") else 10
-        return int(digits, base) + (node if match["after"] or match["before"] else 0)
+        return int(digits, base) + (node_id if match["after"] or match["before"] else 0)
 
     @property
     def hexadecimal(self) -> bool:
@@ -118,9 +118,11 @@ class DataSheet:
     mistake: str | None = None
     cut_off: str = ""
 
-    def has(self, index: int, sub: int | None = None) -> bool:
-        """Return whether the data sheet lists the object `index`, or, with `sub`, this one sub-index of it."""
-        return any(key >> 8 == index for key in self.entries) if sub is None else index << 8 | sub in self.entries
+    def has(self, index: int, subindex: int | None = None) -> bool:
+        """Return whether the data sheet lists the object `index`, or, with `subindex`, this one sub-index of it."""
+        if subindex is None:
+            return any(key >> 8 == index for key in self.entries)
+        return index << 8 | subindex in self.entries
 
 
 @lru_cache(maxsize=32)

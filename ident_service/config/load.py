@@ -74,23 +74,23 @@ def load_arm(arm: str | Path, *, upload: bool = False) -> ArmConfig:
     return config
 
 
-def with_sheets(config: ArmConfig, files: Sequence[str]) -> ArmConfig:
+def with_eds_files(config: ArmConfig, eds_files: Sequence[str]) -> ArmConfig:
     """Return a copy that gives CANopen drives these EDS files when emulated; raises UsageError for another driver.
 
     Args:
         config: of the arm.
-        files: EDS or DCF files, for the drives one after the other; none for the arm as it is.
+        eds_files: EDS or DCF files, for the drives one after the other; none for the arm as it is.
 
     Raises:
         UsageError: one cannot be read, or is no data sheet, or the drives are not CANopen's.
     """
-    if not files:
+    if not eds_files:
         return config
     from ident_service.config.eds import data_sheet  # which only CANopen's drives have
 
     if not is_canopen(config.driver):
         raise UsageError(f"{config.name}: the driver is not CANopen's, so that no data sheet describes its drives")
-    driver, sheets = config.driver, tuple(map(sheet_file, files))
+    driver, sheets = config.driver, tuple(map(read_eds_file, eds_files))
     for sheet in sheets:
         if why := data_sheet(sheet.text).mistake:
             raise UsageError(f"{sheet.name}: not an EDS: {why}")
@@ -98,10 +98,10 @@ def with_sheets(config: ArmConfig, files: Sequence[str]) -> ArmConfig:
     return config.model_copy(update={"driver": driver.model_copy(update={"emulation": emulation})})
 
 
-def sheet_file(name: str) -> TextFile:
+def read_eds_file(path: str) -> TextFile:
     """Read an EDS or DCF file of any encoding as text; raises UsageError where it cannot be read."""
     try:
-        return TypeAdapter(AnyTextBeside).validate_python(name)
+        return TypeAdapter(AnyTextBeside).validate_python(path)
     except ValidationError as error:
         raise UsageError("; ".join(one["msg"].removeprefix("Value error, ") for one in error.errors())) from None
 
@@ -168,32 +168,32 @@ def _load_section(model: type[_Described], path: Path, what: str) -> _Described:
     return _validated(model, read_tree(path), path)
 
 
-def folder_of(arm: str | Path, where: KeyPath) -> Path:
+def folder_of(arm: str | Path, key_path: KeyPath) -> Path:
     """Return the folder of the file in which a key stands: of the description, or of one that it extends.
 
     Args:
         arm: a YAML file, or the name of a shipped description.
-        where: keys from the top of the file.
+        key_path: keys from the top of the file.
     """
     path = find_arm(str(arm))
-    return read_tree(path).problem(where, "", path).path.parent
+    return read_tree(path).problem(key_path, "", path).path.parent
 
 
-def config_error(arm: str | Path, where: KeyPath, message: str) -> ConfigError:
+def config_error(arm: str | Path, key_path: KeyPath, message: str) -> ConfigError:
     """Build, but do not raise, a ConfigError with the place of a key in the YAML file, for mistakes found in use.
 
     Args:
         arm: a YAML file, or the name of a shipped description.
-        where: keys from the top of the file; the nearest of them that stands there is the place.
+        key_path: keys from the top of the file; the nearest of them that stands there is the place.
         message: what is wrong, and what to do.
     """
-    return ConfigError([located(arm, where, f"{'.'.join(map(str, where))}: {message}")])
+    return ConfigError([located_problem(arm, key_path, f"{'.'.join(map(str, key_path))}: {message}")])
 
 
-def located(arm: str | Path, where: KeyPath, message: str) -> Problem:
+def located_problem(arm: str | Path, key_path: KeyPath, message: str) -> Problem:
     """Return a Problem: a message with file, line and column of a description's key or its nearest ancestor."""
     path = find_arm(str(arm))
-    return read_tree(path).problem(where, message, path)
+    return read_tree(path).problem(key_path, message, path)
 
 
 def _validated(kind: type[_Described], tree: Tree, path: Path, context: dict[str, Any] | None = None) -> _Described:
@@ -204,19 +204,19 @@ def _validated(kind: type[_Described], tree: Tree, path: Path, context: dict[str
         raise ConfigError(first_problems(list(_problems(error, tree, path, section)))) from None
 
 
-def nested(schema: Mapping[str, Any], document: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+def nested_schemas(part: Mapping[str, Any], schema: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
     """Yield a part of a JSON schema and, recursively, what its `$ref`, `anyOf` and `allOf` lead to.
 
     Args:
-        schema: the part.
-        document: the whole.
+        part: the part.
+        schema: the whole.
     """
-    yield schema
-    if "$ref" in schema:
-        yield from nested(document["definitions"][schema["$ref"].rpartition("/")[2]], document)
+    yield part
+    if "$ref" in part:
+        yield from nested_schemas(schema["definitions"][part["$ref"].rpartition("/")[2]], schema)
     for words in ("anyOf", "allOf"):
-        for one in schema.get(words, ()):
-            yield from nested(one, document)
+        for one in part.get(words, ()):
+            yield from nested_schemas(one, schema)
 
 
 class KnownKeys:
@@ -227,28 +227,30 @@ class KnownKeys:
         self._document = json.loads(arm_schema_file().read_text(encoding="utf-8"))
         self._root = self._document["definitions"][section] if section else self._document
 
-    def description(self, where: Sequence[str | int], value: Any) -> str:
-        """Return the schema's description of a key; empty for an unknown key. `value` is the file's whole content."""
-        return next((str(one["description"]) for one in self._at(where, value) if "description" in one), "")
+    def description(self, key_path: Sequence[str | int], content: Any) -> str:
+        """Return the schema's description of a key in a file with this `content`; empty for an unknown key."""
+        return next((str(one["description"]) for one in self._at(key_path, content) if "description" in one), "")
 
-    def unit(self, where: Sequence[str | int], value: Any) -> str:
-        """Return the schema's unit of a key (of a list's item: the list's); empty for none. `value`: the whole file."""
-        for length in range(len(where), 0, -1):
-            if found := next((str(one["x-unit"]) for one in self._at(where[:length], value) if "x-unit" in one), ""):
+    def unit(self, key_path: Sequence[str | int], content: Any) -> str:
+        """Return the schema's unit of a key in a file with this `content` (for an item: its list's); empty for none."""
+        for length in range(len(key_path), 0, -1):
+            if found := next(
+                (str(one["x-unit"]) for one in self._at(key_path[:length], content) if "x-unit" in one), ""
+            ):
                 return "" if found == "1" else found
-            if isinstance(where[length - 1], str):
+            if isinstance(key_path[length - 1], str):
                 break
         return ""
 
-    def remedy(self, where: Sequence[str | int], value: Any) -> str:
-        """Return the end of a message on an unknown key: likely spelling, where it belongs, or known keys."""
-        *above, word = where
+    def remedy(self, key_path: Sequence[str | int], content: Any) -> str:
+        """Return the end of a message on an unknown key: likely spelling, where it belongs, or keys known there."""
+        *above, word = key_path
         key = str(word)
-        here = self._keys_at(above, value)
+        here = self._keys_at(above, content)
         if near := did_you_mean(key, here, 0.8):
             return near
         for length in range(len(above) - 1, -1, -1):
-            if key in self._keys_at(above[:length], value):
+            if key in self._keys_at(above[:length], content):
                 outer = ".".join(map(str, above[:length]))
                 place = f"in {outer}" if outer else "at the top of the file"
                 return f"; it belongs {place}, not under {above[-1]}"
@@ -258,16 +260,16 @@ class KnownKeys:
             return f"; it belongs in {' or '.join(elsewhere)}"
         return did_you_mean(key, here) or f"; leave it out: known here are {', '.join(here)}"
 
-    def items(self, where: Sequence[str | int], value: Any) -> int | None:
+    def items(self, key_path: Sequence[str | int], content: Any) -> int | None:
         """Return the number of items that the schema wants of a list (`minItems`); None where that is free."""
-        return next((int(one["minItems"]) for one in self._at(where, value) if "minItems" in one), None)
+        return next((int(one["minItems"]) for one in self._at(key_path, content) if "minItems" in one), None)
 
     def _keys_at(self, where: Sequence[str | int], value: Any) -> list[str]:
         return sorted({key for one in self._at(where, value) for key in one.get("properties", {})})
 
     def _inside(self, part: Mapping[str, Any]) -> Iterator[Iterable[str]]:
         """Yield the keys of a section, in each of its alternatives."""
-        for one in nested(part, self._document):
+        for one in nested_schemas(part, self._document):
             yield one.get("properties", {})
 
     def _at(self, where: Sequence[str | int], value: Any) -> list[Mapping[str, Any]]:
@@ -302,10 +304,12 @@ class KnownKeys:
         return found
 
 
-def fits_kind(value: Mapping[str, Any], part: Mapping[str, Any], document: Mapping[str, Any]) -> bool:
+def fits_kind(mapping: Mapping[str, Any], schema_part: Mapping[str, Any], schema: Mapping[str, Any]) -> bool:
     """Return whether the mapping's `kind` is one that the schema part allows; True where either has no `kind`."""
-    kinds = [one["properties"]["kind"] for one in nested(part, document) if "kind" in one.get("properties", {})]
-    return "kind" not in value or not kinds or any(value["kind"] == one.get("const") for one in kinds)
+    kinds = [
+        one["properties"]["kind"] for one in nested_schemas(schema_part, schema) if "kind" in one.get("properties", {})
+    ]
+    return "kind" not in mapping or not kinds or any(mapping["kind"] == one.get("const") for one in kinds)
 
 
 def _problems(error: ValidationError, tree: Tree, path: Path, section: str = "") -> Iterator[Problem]:

@@ -39,22 +39,22 @@ class MotorLimits:
         """Return names of the motors for messages, `motor 1` and so on, in the order of the transmission's ratios."""
         return tuple(f"motor {number + 1}" for number in range(len(self.torque)))
 
-    def used(self, torque: Vector) -> Vector:
+    def torque_shares(self, joint_torque: Vector) -> Vector:
         """Return each motor's share of its torque limit for joint torques [N m or N], shape (..., motors)."""
-        return np.asarray(np.abs(torque @ self.to_motors.T) / self.torque)
+        return np.asarray(np.abs(joint_torque @ self.to_motors.T) / self.torque)
 
-    def used_of_joints(self, torque: Vector) -> Vector:
-        """Return per joint the largest `used` share of motors coupled with it, even indirectly, shape (..., joints)."""
-        shares = np.where(self.together, self.used(torque)[..., None, :], 0.0)
+    def torque_shares_of_joints(self, joint_torque: Vector) -> Vector:
+        """Return per joint the largest share of a motor coupled with it, even indirectly, shape (..., joints)."""
+        shares = np.where(self.together, self.torque_shares(joint_torque)[..., None, :], 0.0)
         return np.asarray(shares.max(axis=-1))
 
-    def limited(self, torque: Vector) -> Vector:
+    def scaled_within(self, joint_torque: Vector) -> Vector:
         """Return joint torques [N m or N] scaled down until no motor exceeds its limit, shape (joints,).
 
         Joints that share motors are scaled by one factor, so that no joint is pushed the other way, as drives do that
         are asked for too much (`drivers/motor_units.py`).
         """
-        return np.asarray(torque / np.maximum(self.used_of_joints(torque), 1.0))
+        return np.asarray(joint_torque / np.maximum(self.torque_shares_of_joints(joint_torque), 1.0))
 
 
 @dataclass(frozen=True)

@@ -63,9 +63,9 @@ class ExtendedSection(Section):
         return {k: v for k, v in document.items() if k not in self.later or getattr(self, k) != fields[k].default}
 
 
-def did_you_mean(word: str, known: Iterable[str], cutoff: float = 0.6) -> str:
+def did_you_mean(word: str, known_words: Iterable[str], cutoff: float = 0.6) -> str:
     """Return `; did you mean 'X'?` with the known word nearest to a misspelt one; empty where none is near."""
-    lower = {one.lower(): one for one in known}
+    lower = {one.lower(): one for one in known_words}
     near = difflib.get_close_matches(word.lower(), lower, n=1, cutoff=cutoff)
     return f"; did you mean {lower[near[0]]!r}?" if near else ""
 

@@ -106,17 +106,17 @@ class Column(Section):
         # A plain name, so that descriptions without units keep the hash they had before units existed.
         return self.column if self.unit is None and self.factor == 1.0 else serialized(self)
 
-    def si_factor(self, name: str) -> float:
+    def si_factor(self, ident_column: str) -> float:
         """Return the factor from this column's numbers to SI; raises ValueError where its unit does not fit.
 
         Args:
-            name: name of the column in `ident`'s own files, such as `tau3`, which says the quantity.
+            ident_column: name of the column in `ident`'s own files, such as `tau3`, which says the quantity.
 
         Raises:
             ValueError: an unknown unit, one of another quantity, one that needs a factor, or a factor that repeats
                 the unit's own conversion.
         """
-        quantity = _QUANTITIES[name.rstrip("0123456789")]
+        quantity = _QUANTITIES[ident_column.rstrip("0123456789")]
         own, bare = _CONVERTED[quantity], _WITH_FACTOR[quantity]
         if quantity == "time" and self.factor < 0.0:
             raise ValueError(f"a factor of {self.factor:g} lets time run backwards")
@@ -217,8 +217,8 @@ _LONGEST_LOSS, _MOST_LOST = 0.010, 5  # s; cycles
 
 
 def motor_disagreements(
-    what: tuple[str, str],
-    motors: int,
+    motors_name_and_key: tuple[str, str],
+    motor_count: int,
     lost_cycles: int,
     transmission: Transmission | None,
     joints: Sequence[str],
@@ -227,14 +227,14 @@ def motor_disagreements(
     """Yield (key path, message) for each contradiction between motors on a bus, gears, joints and `lost_cycles`.
 
     Args:
-        what: the motors' name, and their key in the section `driver`.
-        motors: number of motors.
+        motors_name_and_key: the motors' name, and their key in the section `driver`.
+        motor_count: number of motors.
         lost_cycles: `driver.lost_cycles`.
         transmission: the arm's.
         joints: names of the arm's joints; none where the file does not name them.
         rate: cycles per second.
     """
-    name, key = what
+    name, key = motors_name_and_key
     most = max(_MOST_LOST, _LONGEST_LOSS * rate)
     if lost_cycles > most:
         yield (
@@ -244,10 +244,10 @@ def motor_disagreements(
         )
     if transmission is None:
         yield ("driver",), f"{name} need the section transmission: gear ratios from joints to motors"
-    elif len(transmission.ratios) != motors:
-        yield ("driver", key), f"{motors} {key} but {len(transmission.ratios)} ratios in transmission"
-    if joints and len(joints) != motors:
-        yield ("driver", key), f"{motors} {key} for {len(joints)} joints"
+    elif len(transmission.ratios) != motor_count:
+        yield ("driver", key), f"{motor_count} {key} but {len(transmission.ratios)} ratios in transmission"
+    if joints and len(joints) != motor_count:
+        yield ("driver", key), f"{motor_count} {key} for {len(joints)} joints"
 
 
 class RecordingFormat(Section):
@@ -330,18 +330,20 @@ def _joints(columns: Mapping[str, Column]) -> int:
     return max((int(match[2]) for name in columns if (match := _NUMBERED.fullmatch(name))), default=0)
 
 
-def mismatched_units(form: RecordingFormat, joints: Sequence[str], revolute: Sequence[bool]) -> Iterator[str]:
+def mismatched_units(
+    recording_format: RecordingFormat, joints: Sequence[str], revolute: Sequence[bool]
+) -> Iterator[str]:
     """Yield a message for each joint-side column whose unit is a prismatic joint's, for a revolute one, or vice versa.
 
     Quantities measured at a motor are rotary whatever the joint is, and are not checked.
 
     Args:
-        form: the section `recording`.
+        recording_format: the section `recording`.
         joints: names of the arm's joints.
         revolute: mask of the revolute joints.
     """
-    positions, torques = form.motor_sides
-    for name, one in form.columns.items():
+    positions, torques = recording_format.motor_sides
+    for name, one in recording_format.columns.items():
         match = _NUMBERED.fullmatch(name)
         if match is None or one.unit is None or int(match[2]) > len(joints):
             continue
@@ -357,17 +359,17 @@ def mismatched_units(form: RecordingFormat, joints: Sequence[str], revolute: Seq
 
 
 def disagreements(
-    form: RecordingFormat, transmission: Transmission | None, joints: Sequence[str]
+    recording_format: RecordingFormat, transmission: Transmission | None, joints: Sequence[str]
 ) -> Iterator[tuple[tuple[str, ...], str]]:
     """Yield (key path, message) for each contradiction of section `recording` with transmission and joints.
 
     Args:
-        form: the section `recording`.
+        recording_format: the section `recording`.
         transmission: the section `transmission`.
         joints: names of the arm's joints; none where the file does not name them.
     """
-    for key, motors in zip(("side", "torque_side"), form.motor_sides, strict=True):
-        if motors and transmission is None and getattr(form, key) == "motor":
+    for key, motors in zip(("side", "torque_side"), recording_format.motor_sides, strict=True):
+        if motors and transmission is None and getattr(recording_format, key) == "motor":
             yield ("recording", key), f"recording.{key}: motor, but there is no transmission"
     if not joints:
         return
@@ -376,11 +378,11 @@ def disagreements(
             ("transmission", "ratios"),
             f"transmission.ratios: {len(transmission.ratios)} values for {len(joints)} joints",
         )
-    if form.columns and _joints(form.columns) != len(joints):
+    if recording_format.columns and _joints(recording_format.columns) != len(joints):
         yield (
             ("recording", "columns"),
-            f"recording.columns: {_joints(form.columns)} joints, but the arm has {len(joints)}",
+            f"recording.columns: {_joints(recording_format.columns)} joints, but the arm has {len(joints)}",
         )
-    for name in form.joint_names:
+    for name in recording_format.joint_names:
         if name not in joints:
             yield ("recording", "joint_names", name), f"recording.joint_names: no joint {name!r}"

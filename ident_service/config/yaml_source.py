@@ -54,12 +54,12 @@ class Tree:
     value: Any
     places: dict[KeyPath, tuple[Path, int, int]] = field(default_factory=dict)
 
-    def problem(self, path: KeyPath, message: str, fallback: Path) -> Problem:
-        """Return a Problem at a key's place, or its nearest ancestor's; at line 1 of `fallback` where none has one."""
-        for length in range(len(path), -1, -1):
-            if place := self.places.get(path[:length]):
+    def problem(self, key_path: KeyPath, message: str, fallback_file: Path) -> Problem:
+        """Return a Problem at a key's place or its nearest ancestor's, at line 1 of `fallback_file` without either."""
+        for length in range(len(key_path), -1, -1):
+            if place := self.places.get(key_path[:length]):
                 return Problem(*place, message)
-        return Problem(fallback, 1, 1, message)
+        return Problem(fallback_file, 1, 1, message)
 
 
 def first_problems(problems: Sequence[Problem]) -> list[Problem]:

@@ -49,7 +49,7 @@ from ident_service.daemon.web import (
 )
 from ident_service.operations.acceptance import synchronise
 from ident_service.operations.deletion import remove_deleted
-from ident_service.registry.arms import know_shipped
+from ident_service.registry.arms import register_shipped_arms
 from ident_service.registry.database import Database, write_deferred_entries
 from ident_service.registry.runs import rebuild_runs
 from ident_service.registry.tokens import first_token
@@ -85,7 +85,7 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
     """
     db = Database(settings.state)
     first_token(db, settings.state)
-    know_shipped(db)
+    register_shipped_arms(db)
     metrics = Metrics()
     engine = Engine(
         *(db, settings.state),
@@ -157,7 +157,7 @@ async def _refresh(service: Service) -> None:
                     _LOG.info("an upload was left alone for a day and is deleted", extra={"upload": upload})
             await run_in_threadpool(write_deferred_entries, service.db, service.state)
             await run_in_threadpool(service.authenticator.refresh)
-            await run_in_threadpool(service.db.rest)
+            await run_in_threadpool(service.db.checkpoint_when_idle)
         except (sqlite3.Error, OSError) as error:
             _LOG.error("the state folder cannot be looked after: %s", error)
 

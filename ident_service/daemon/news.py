@@ -22,8 +22,8 @@ from typing import Any, Final
 from ident_service.errors import IdentError
 from ident_service.operations.moving_arms import moving_arms
 from ident_service.registry import jobs as rows
-from ident_service.registry.database import Database, Row, audit_entries_after, last_line
-from ident_service.registry.state_folder import fault_file
+from ident_service.registry.database import Database, Row, audit_entries_after, newest_line_id
+from ident_service.registry.state_folder import arm_fault_store
 
 LOOK: Final = 0.25  # s between polls, however many viewers there are
 _PAGE = 500  # lines that are read at a time
@@ -97,7 +97,7 @@ class EventPoller:
         Args:
             last_seen_line: number of the last line that was seen; only events from now on are reported if None.
         """
-        last = last_line(self._db)
+        last = newest_line_id(self._db)
         # A number beyond the last line comes from another state folder, or from before a restore.
         return ViewerPosition(last if last_seen_line is None or last_seen_line > last else last_seen_line)
 
@@ -150,7 +150,7 @@ class EventPoller:
 
     def _read_lines(self) -> None:
         if self._line is None:
-            self._line = last_line(self._db)
+            self._line = newest_line_id(self._db)
         while found := audit_entries_after(self._db, self._line, _PAGE):
             for row in found:
                 self._lines.append(_line(row))
@@ -179,7 +179,7 @@ class EventPoller:
                 del self._standing[kind, name]
         for folder in folders:
             try:
-                faults = sorted(fault_file(self._state, folder.name).latched())
+                faults = sorted(arm_fault_store(self._state, folder.name).latched())
             except IdentError:
                 faults = ["unreadable"]  # a damaged file prevents motion like a fault
             self._update_state(

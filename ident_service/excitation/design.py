@@ -96,7 +96,9 @@ def _torque_used(model: ArmModel, limits: MotionLimits, postures: Array) -> Arra
     _, dry = dry_friction(model, model.prior)
     gravity = np.einsum("jps,p->sj", rows, model.prior)
     used = (np.abs(gravity) + dry) / limits.torque
-    return np.asarray(used if limits.motors is None else np.maximum(used, limits.motors.used_of_joints(gravity)))
+    return np.asarray(
+        used if limits.motors is None else np.maximum(used, limits.motors.torque_shares_of_joints(gravity))
+    )
 
 
 def _reason(

@@ -253,7 +253,7 @@ def _followed(
         torque = law.torque(q, rate, push[k] + kd * (pace[k] - rate) + kp * away) + feedforward[k]
         np.maximum(fastest, np.abs(rate), out=fastest)
         torque = np.minimum(np.maximum(torque, -limit), limit)
-        queue.append(torque if limits.motors is None else limits.motors.limited(torque))
+        queue.append(torque if limits.motors is None else limits.motors.scaled_within(torque))
         after = plant.next_velocity(q, v, queue.popleft(), period)
         q, v = q + 0.5 * period * (v + after), after
     return positions, fastest

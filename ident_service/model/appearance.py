@@ -108,7 +108,7 @@ def visual_meshes(file: Path, kinematics: Kinematics, chain: Chain) -> list[Mesh
                 continue
             if link.joint is None:
                 raise UsageError(f"{link.where} hangs on joint {link.carrier!r}, which the arm does not have")
-            rotation, translation = link.place(visual)
+            rotation, translation = link.element_pose(visual)
             found = _mesh_file(file, mesh.get("filename", ""), link.where)
             scale = mesh_scale(mesh.get("scale", "1 1 1"), link.where)
             meshes.append(Mesh(link.joint, found, rotation, translation, scale))
@@ -135,9 +135,9 @@ class PlacedLink:
     rotation: Array
     translation: Array
 
-    def place(self, part: ET.Element) -> tuple[Array, Array]:
+    def element_pose(self, element: ET.Element) -> tuple[Array, Array]:
         """Return rotation and translation [m] of a visual or collision element in the joint's frame."""
-        rotation, translation = origin_of(part.find("origin"), self.where)
+        rotation, translation = origin_of(element.find("origin"), self.where)
         return self.rotation @ rotation, self.rotation @ translation + self.translation
 
 
@@ -157,14 +157,14 @@ def placed_links(urdf: TextFile, kinematics: Kinematics, chain: Chain) -> Iterat
             yield PlacedLink(where, element, known, carrier, rotation, translation)
 
 
-def mesh_scale(text: str, where: str) -> Array:
+def mesh_scale(text: str, error_prefix: str) -> Array:
     """Return the three factors of a mesh's `scale`, shape (3,); raises UsageError where it is not three numbers."""
     try:
         values = np.array([float(word) for word in text.split()])
     except ValueError:
         values = np.zeros(0)
     if values.shape != (3,) or not np.isfinite(values).all():
-        raise UsageError(f"{where}: the scale {text!r} of a mesh is not three numbers")
+        raise UsageError(f"{error_prefix}: the scale {text!r} of a mesh is not three numbers")
     return values
 
 

@@ -123,12 +123,12 @@ def _require_bodies(config: ArmConfig, urdf: TextFile, inertias: Array) -> None:
         )
 
 
-def with_payload(config: ArmConfig, names: tuple[str, ...], layout: Layout, delta: Array) -> Array:
-    """Return link parameters plus those of the description's payload, shape (layout.size,); unchanged without one.
+def with_payload(config: ArmConfig, joint_names: tuple[str, ...], layout: Layout, delta: Array) -> Array:
+    """Return link parameters `delta` with the description's payload added, shape (layout.size,); `delta` without one.
 
     Args:
         config: the description.
-        names: of the joints.
+        joint_names: of the joints.
         layout: of `delta`.
         delta: parameters of the arm alone [SI], shape (layout.size,).
 
@@ -138,10 +138,12 @@ def with_payload(config: ArmConfig, names: tuple[str, ...], layout: Layout, delt
     payload = config.payload
     if payload is None:
         return delta
-    if payload.link is not None and payload.link not in names:
-        raise ModelError(f"{config.name}: payload.link: {payload.link!r} is none of {', '.join(names)}")
+    if payload.link is not None and payload.link not in joint_names:
+        raise ModelError(f"{config.name}: payload.link: {payload.link!r} is none of {', '.join(joint_names)}")
     loaded = delta.copy()
-    loaded[layout.inertial(len(names) - 1 if payload.link is None else names.index(payload.link))] += payload.parameters
+    loaded[layout.inertial(len(joint_names) - 1 if payload.link is None else joint_names.index(payload.link))] += (
+        payload.parameters
+    )
     return loaded
 
 

@@ -156,7 +156,7 @@ def base_parameters(chain: Chain, layout: Layout) -> BaseParameters:
 
 
 def grouping(H: Array, names: tuple[str, ...], units: tuple[str, ...]) -> BaseParameters:
-    """Group parameters into base parameters: the first independent columns of H, others as combinations of them.
+    """Group parameters into base parameters: the first independent columns of regressor H; others combine them.
 
     Args:
         H: a regressor at enough states, or K itself for some of its columns, shape (rows, names).

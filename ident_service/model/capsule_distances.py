@@ -43,8 +43,13 @@ def unit(vectors: Array) -> tuple[Array, Array]:
     return length, vectors * (1.0 / np.maximum(length, 1e-150))
 
 
-def between_segments(
-    start: Array, along: Array, other_start: Array, other_along: Array, squares: Array, other_squares: Array
+def distances_between_segments(
+    start: Array,
+    along: Array,
+    other_start: Array,
+    other_along: Array,
+    squared_lengths: Array,
+    other_squared_lengths: Array,
 ) -> tuple[Array, Array, Array, Array]:
     """Return distances [m], directions and nearest places (0 to 1 along) of pairs of segments, also degenerate ones.
 
@@ -55,15 +60,15 @@ def between_segments(
         along: vectors from start to end of the first segments [m], shape (3, pairs, samples).
         other_start: starting points of the second segments [m], shape (3, pairs, samples).
         other_along: vectors from start to end of the second segments [m], shape (3, pairs, samples).
-        squares: squared lengths of the first ones [m^2], shape (pairs, 1).
-        other_squares: squared lengths of the second ones [m^2], shape (pairs, 1).
+        squared_lengths: squared lengths of the first ones [m^2], shape (pairs, 1).
+        other_squared_lengths: squared lengths of the second ones [m^2], shape (pairs, 1).
 
     Returns:
         Distances, directions from the second to the first, and the shares along the first and the second segment.
     """
     apart = start - other_start
     b, c, f = dot(along, other_along), dot(along, apart), dot(other_along, apart)
-    a, e = squares, other_squares
+    a, e = squared_lengths, other_squared_lengths
     determinant = a * e - b * b
     # Of parallel lines any point of the first will do.
     skew = determinant > 1e-14 * a * e
@@ -79,7 +84,7 @@ def _inverse(squares: Array) -> Array:
     return np.where(squares > 0.0, 1.0 / np.where(squares > 0.0, squares, 1.0), 0.0)
 
 
-def to_half_spaces(start: Array, along: Array, normal: Array, offset: Array) -> tuple[Array, Array]:
+def distances_to_half_spaces(start: Array, along: Array, normal: Array, offset: Array) -> tuple[Array, Array]:
     """Return signed distances [m] of segments to half spaces, and which end is nearest: 0 start, 1 end.
 
     Args:
@@ -96,7 +101,7 @@ def to_half_spaces(start: Array, along: Array, normal: Array, offset: Array) -> 
     return np.asarray(dot(normal, start) - offset + share * slope), share
 
 
-def to_boxes(start: Array, along: Array, half: Array) -> tuple[Array, Array, Array]:
+def distances_to_boxes(start: Array, along: Array, half_edges: Array) -> tuple[Array, Array, Array]:
     """Return signed distances [m] of segments to boxes about the origin, gradients and nearest places (0 to 1 along).
 
     Outside, half the slope of the squared distance is linear between the places where the line crosses a face's plane.
@@ -105,17 +110,17 @@ def to_boxes(start: Array, along: Array, half: Array) -> tuple[Array, Array, Arr
     Args:
         start: starting points in the box's frame [m], shape (3, pairs, samples).
         along: vectors from start to end [m], shape (3, pairs, samples).
-        half: half edges [m], shape (3, pairs, 1).
+        half_edges: half edges [m], shape (3, pairs, 1).
 
     Returns:
         Signed distances of the nearest points, their gradients with respect to the point, and their shares.
     """
-    share = _nearest(start, along, half)
-    distance, gradient = _box_gradient(start + along * share, half)
+    share = _nearest(start, along, half_edges)
+    distance, gradient = _box_gradient(start + along * share, half_edges)
     enters = distance < _TOUCH
     if enters.any():
         inner, way = start[:, enters], along[:, enters]
-        edges = np.broadcast_to(half, start.shape)[:, enters]
+        edges = np.broadcast_to(half_edges, start.shape)[:, enters]
         distance[enters], gradient[:, enters], share[enters] = _deepest(inner, way, edges)
     return distance, gradient, share
 
@@ -147,7 +152,7 @@ def _slope(start: Array, along: Array, half: Array, share: Array) -> Array:
 
 
 def _deepest(start: Array, along: Array, half: Array) -> tuple[Array, Array, Array]:
-    """Return distance, gradient and share, as `to_boxes`, of segments that enter their box, shape (3, segments)."""
+    """Return distance, gradient and share, as `distances_to_boxes`, for segments that enter a box, (3, segments)."""
     low, high = np.zeros(start.shape[1:]), np.ones(start.shape[1:])
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
@@ -356,7 +361,7 @@ class _RoundPairs(_Family):
 
     def distances(self, start: Array, along: Array) -> Array:
         first, second = self._first, self._second
-        distance, self._direction, self._share, self._other_share = between_segments(
+        distance, self._direction, self._share, self._other_share = distances_between_segments(
             start[:, first], along[:, first], start[:, second], along[:, second], self._squares, self._other_squares
         )
         return np.asarray(distance - self._radius)
@@ -374,7 +379,9 @@ class _PlanePairs(_Family):
         self._offset = np.array([[plane.offset] for plane in planes])
 
     def distances(self, start: Array, along: Array) -> Array:
-        distance, self._share = to_half_spaces(start[:, self._first], along[:, self._first], self._normal, self._offset)
+        distance, self._share = distances_to_half_spaces(
+            start[:, self._first], along[:, self._first], self._normal, self._offset
+        )
         self._direction = self._normal
         return np.asarray(distance - self._radius)
 
@@ -391,7 +398,7 @@ class _BoxPairs(_Family):
             np.einsum("pij,ips->jps", self._rotation, vectors)
             for vectors in (start[:, self._first] - self._center, along[:, self._first])
         )
-        distance, gradient, self._share = to_boxes(start, along, self._half)
+        distance, gradient, self._share = distances_to_boxes(start, along, self._half)
         self._direction = np.einsum("pij,jps->ips", self._rotation, gradient)
         return np.asarray(distance - self._radius)
 

@@ -342,14 +342,16 @@ class CollisionModel:
         )
 
 
-def share_touching(model: ArmModel, within: float, postures: int, seed: int) -> dict[tuple[str, str], float]:
-    """Return per pair that must not touch the share (0 to 1) of random postures with less than `within` [m] between.
+def shares_touching(
+    model: ArmModel, touching_distance: float, postures: int, seed: int
+) -> dict[tuple[str, str], float]:
+    """Return per pair that must not touch the share (0 to 1) of random postures nearer than `touching_distance`.
 
     Of each pair the moving link comes first.
 
     Args:
         model: model of an arm, also of one whose bodies always touch.
-        within: nearer than this counts as touching [m].
+        touching_distance: nearer than this counts as touching [m].
         postures: number of postures drawn, within the position limits.
         seed: of the draw.
 
@@ -367,7 +369,7 @@ def share_touching(model: ArmModel, within: float, postures: int, seed: int) -> 
     touching = np.zeros((postures, len(every)), dtype=bool)
     for row, posture in zip(touching, drawn, strict=True):
         pin.computeDistances(mechanism, data, solids, found, posture)
-        row[:] = [result.min_distance <= within for result in found.distanceResults]
+        row[:] = [result.min_distance <= touching_distance for result in found.distanceResults]
     shares, start = {}, 0
     for contacts in around.contacts:
         first, second = contacts[0]
@@ -420,17 +422,17 @@ def lowest_point(model: ArmModel) -> Callable[[Array], float]:
     return height
 
 
-def geometry(around: Scene, contacts: Sequence[tuple[int, int]]) -> tuple[pin.GeometryModel, pin.GeometryData]:
-    """Build coal geometry of all bodies, and the data object for the distances of the given pairs of them.
+def geometry(bodies: Scene, pairs: Sequence[tuple[int, int]]) -> tuple[pin.GeometryModel, pin.GeometryData]:
+    """Build coal geometry of all bodies, and the data object for the distances of `pairs` of their indices.
 
     Args:
-        around: the bodies.
-        contacts: pairs of their indices.
+        bodies: the bodies.
+        pairs: pairs of their indices.
     """
     solids = pin.GeometryModel()
-    for index, body in enumerate(around.bodies):
+    for index, body in enumerate(bodies.bodies):
         solids.addGeometryObject(_object(f"{index} {body.owner}", body))
-    for first, second in contacts:
+    for first, second in pairs:
         solids.addCollisionPair(pin.CollisionPair(first, second))
     found = pin.GeometryData(solids)
     for request in found.distanceRequests:

@@ -72,22 +72,22 @@ def _link_triangles(link: PlacedLink, folder: Path) -> list[Array]:
         triangles = mesh_triangles(path, mesh_scale(mesh.get("scale", "1 1 1"), link.where))
         if triangles is None:
             raise UsageError(f"{link.where}: the mesh {name!r} cannot be read")
-        rotation, translation = link.place(part)
+        rotation, translation = link.element_pose(part)
         found.append(triangles @ rotation.T + translation)
     return found
 
 
-def coarsened(corners: Array, most: int) -> Array:
-    """Return at most `most` triangles: corners are moved onto ever coarser grids, and collapsed triangles dropped.
+def coarsened(triangles: Array, max_triangles: int) -> Array:
+    """Return at most `max_triangles` triangles: corners move onto ever coarser grids, collapsed triangles are dropped.
 
     Args:
-        corners: of the triangles [m], shape (triangles, 3, 3).
-        most: number of triangles.
+        triangles: of the triangles [m], shape (triangles, 3, 3).
+        max_triangles: number of triangles.
     """
-    cell = float(np.ptp(corners.reshape(-1, 3), axis=0).max()) / _CELLS if len(corners) else 0.0
-    while len(corners) > most and cell > 0.0:
-        cells = np.round(corners / cell).astype(np.int64)
+    cell = float(np.ptp(triangles.reshape(-1, 3), axis=0).max()) / _CELLS if len(triangles) else 0.0
+    while len(triangles) > max_triangles and cell > 0.0:
+        cells = np.round(triangles / cell).astype(np.int64)
         whole = (cells != np.roll(cells, 1, axis=1)).any(axis=2).all(axis=1)
-        corners = np.unique(cells[whole].reshape(-1, 9), axis=0).reshape(-1, 3, 3) * cell
+        triangles = np.unique(cells[whole].reshape(-1, 9), axis=0).reshape(-1, 3, 3) * cell
         cell *= _COARSER
-    return corners[:most]
+    return triangles[:max_triangles]

@@ -66,7 +66,7 @@ class DynamicModel:
         # Drive inertia beyond the armatures: zero where every joint has its own drive.
         self._shared = chain.coupling.T @ (inertia[:, None] * chain.coupling) - np.diag(drives.armature)
 
-    def turned(self, direction: Array, step: Array) -> Array:
+    def turned(self, direction: Array, displacement: Array) -> Array:
         """Return each drive's dry-friction direction, -1 to 1, after a displacement of the joints (Dahl 1968).
 
         Exact where no drive reverses in the step.
@@ -74,12 +74,14 @@ class DynamicModel:
         Args:
             direction: direction before the step, per drive, between -1 and 1, shape (..., joints); the signs of the
                 first motion, where nothing is known.
-            step: displacement of the joints in the step [rad or m], shape (..., joints).
+            displacement: displacement of the joints in the step [rad or m], shape (..., joints).
 
         Returns:
             Shape (..., joints).
         """
-        return advance_dahl_state(direction, np.asarray(step, dtype=float) @ self.arm.chain.coupling.T, self.presliding)
+        return advance_dahl_state(
+            direction, np.asarray(displacement, dtype=float) @ self.arm.chain.coupling.T, self.presliding
+        )
 
     def friction(self, velocity: Array, direction: Array | None = None) -> Array:
         """Return the friction torque of the joints [N m or N], offsets included, shape (..., joints).
@@ -155,6 +157,6 @@ def read_back(
     Raises:
         ModelError: it cannot be read.
     """
-    found = read_mechanism(file, kind, kinematics, own=True)
+    found = read_mechanism(file, kind, kinematics, trusted=True)
     chain, bodies = chain_of(found, gravity)
     return WrittenArm(chain, bodies, found.armature.copy(), found.damping.copy(), found.dry_friction.copy())

@@ -42,18 +42,18 @@ class ExpectedFriction:
         return ExpectedFriction(self.coulomb @ moves, np.diag((moves.T * self.viscous) @ moves), self.offset @ moves)
 
 
-def expected_friction(model: ArmModel, limits: MotionLimits, guess: tuple[float, float]) -> ExpectedFriction:
-    """Return each drive's friction: the prior's where it has any, else the guess from torque and velocity limits.
+def expected_friction(model: ArmModel, limits: MotionLimits, guessed_shares: tuple[float, float]) -> ExpectedFriction:
+    """Return each drive's friction: the prior's where it has any, else `guessed_shares` of its torque limit.
 
     Args:
         model: of the arm.
         limits: full limits of the arm.
-        guess: Coulomb friction, and viscous friction at the velocity limit, in shares of the torque limit: the joint's,
-            or, of drives that move several joints, the most that a joint's limit alone asks of the drive.
+        guessed_shares: Coulomb friction, and viscous friction at the velocity limit, as shares of the torque limit: the
+            joint's, or, of drives that move several joints, the most that a joint's limit alone asks of the drive.
     """
     coupling = model.chain.coupling
     torque = (np.abs(np.linalg.inv(coupling).T) * limits.torque).max(axis=1)
-    coulomb, viscous = guess[0] * torque, guess[1] * torque / (np.abs(coupling) @ limits.velocity)
+    coulomb, viscous = guessed_shares[0] * torque, guessed_shares[1] * torque / (np.abs(coupling) @ limits.velocity)
     if model.prior is None:
         return ExpectedFriction(coulomb, viscous, np.zeros_like(coulomb))
     known = [model.layout.term_values(term, model.prior) for term in ("coulomb", "viscous", "offset")]

@@ -31,41 +31,49 @@ def presliding_distances(model: ArmModel) -> Array:
     return np.array(np.broadcast_to(np.asarray(given, dtype=float), (model.chain.joints,)))
 
 
-def advance_dahl_state(direction: Array, step: Array, lengths: Array) -> Array:
-    """Return the dry-friction direction of each drive, -1 to 1, after a step without reversal (Dahl 1968).
+def advance_dahl_state(direction: Array, displacement: Array, presliding_lengths: Array) -> Array:
+    """Return each drive's dry-friction direction, -1 to 1, after a displacement without reversal (Dahl 1968).
 
     Args:
         direction: direction before the step, between -1 and 1, shape (..., drives).
-        step: displacement of the drives, none of which reverses meanwhile [rad or m], shape (..., drives).
-        lengths: x0 [rad or m], shape (drives,).
+        displacement: displacement of the drives, none of which reverses meanwhile [rad or m], shape (..., drives).
+        presliding_lengths: x0 [rad or m], shape (drives,).
 
     Returns:
         Shape (..., drives).
     """
-    sign, distance = np.sign(step), np.abs(step)
-    left = np.exp(-distance / np.where(lengths > 0.0, lengths, 1.0))
-    return np.asarray(sign + np.where(lengths > 0.0, (direction - sign) * left, 0.0))
+    sign, distance = np.sign(displacement), np.abs(displacement)
+    left = np.exp(-distance / np.where(presliding_lengths > 0.0, presliding_lengths, 1.0))
+    return np.asarray(sign + np.where(presliding_lengths > 0.0, (direction - sign) * left, 0.0))
 
 
-def friction_direction(rate: Array, period: float, presliding: Array, start: Array | None = None) -> Array:
+def friction_direction(
+    drive_velocity: Array, period: float, presliding_lengths: Array, start_direction: Array | None = None
+) -> Array:
     """Return the dry-friction direction of each drive at each sample, -1 to 1, shape (samples, drives).
 
     Args:
-        rate: drive velocities [rad/s or m/s], shape (samples, drives).
+        drive_velocity: drive velocities [rad/s or m/s], shape (samples, drives).
         period: of the samples [s].
-        presliding: x0 per drive [rad or m], shape (drives,); 0 for the sign itself.
-        start: direction before the first sample, shape (drives,); the first sign that follows when None.
+        presliding_lengths: x0 per drive [rad or m], shape (drives,); 0 for the sign itself.
+        start_direction: direction before the first sample, shape (drives,); the first sign that follows when None.
     """
-    result = np.empty_like(rate)
-    for drive, x0 in enumerate(presliding):
-        signs = np.sign(rate[:, drive])
+    result = np.empty_like(drive_velocity)
+    for drive, x0 in enumerate(presliding_lengths):
+        signs = np.sign(drive_velocity[:, drive])
         if x0 <= 0.0:
             result[:, drive] = signs
             continue
         # Where the velocity is exactly zero nothing is travelled, and the last sign may stand.
         moving = np.flatnonzero(signs)
-        before = signs[moving[0]] if start is None and len(moving) else 0.0 if start is None else float(start[drive])
-        travelled = np.cumsum(np.abs(rate[:, drive])) * (period / x0)
+        before = (
+            signs[moving[0]]
+            if start_direction is None and len(moving)
+            else 0.0
+            if start_direction is None
+            else float(start_direction[drive])
+        )
+        travelled = np.cumsum(np.abs(drive_velocity[:, drive])) * (period / x0)
         last = np.maximum.accumulate(np.where(signs != 0.0, np.arange(len(signs)), -1))
         held = np.where(last >= 0, signs[np.maximum(last, 0)], np.sign(before) or 1.0)
         turns = np.flatnonzero(np.diff(held)) + 1

@@ -106,7 +106,7 @@ class Information:
         return whole
 
     def squared_residuals(self, beta: Array) -> Array:
-        """Return per joint the sum of squared torque errors of `beta` [N^2 m^2 or N^2], shape (joints,)."""
+        """Return per joint the sum of squared torque errors of base parameters `beta` [N^2 m^2 or N^2], (joints,)."""
         errors = [
             factor[:, -1] - factor[:, :-1] @ beta[support]
             for support, factor in zip(self.supports, self.factors, strict=True)
@@ -118,21 +118,21 @@ class Information:
         factors = tuple(weight * factor for weight, factor in zip(weights, self.factors, strict=True))
         return Information(self.supports, factors, self.rows.copy(), self.base)
 
-    def with_torques_times(self, scales: Array) -> Information:
-        """Return a copy with each joint's torque multiplied by `scales`, shape (joints,)."""
-        factors = []
-        for scale, factor in zip(scales, self.factors, strict=True):
-            scaled = factor.copy()
-            scaled[:, -1] *= scale
-            factors.append(scaled)
-        return Information(self.supports, tuple(factors), self.rows.copy(), self.base)
+    def with_torques_times(self, factors: Array) -> Information:
+        """Return a copy with each joint's torque multiplied by `factors`, shape (joints,)."""
+        triangles = []
+        for factor, triangle_of_joint in zip(factors, self.factors, strict=True):
+            scaled = triangle_of_joint.copy()
+            scaled[:, -1] *= factor
+            triangles.append(scaled)
+        return Information(self.supports, tuple(triangles), self.rows.copy(), self.base)
 
     def squared_torques(self) -> Array:
         """Return per joint the sum of squared torques [N^2 m^2 or N^2], shape (joints,)."""
         return np.array([float(factor[:, -1] @ factor[:, -1]) for factor in self.factors])
 
     def scores(self, beta: Array, weights: Array | None = None) -> Array:
-        """Return the negative gradient of half the squared residual, `W^T (omega - W beta)`, shape (base,).
+        """Return the negative gradient of half the squared residual at base parameters `beta`, `W^T (omega - W beta)`.
 
         Args:
             beta: base parameters, shape (base,).
@@ -178,16 +178,16 @@ def sparsity(chain: Chain, layout: Layout, base_columns: NDArray[np.intp]) -> tu
     return tuple(felt)
 
 
-def empty_information(joint_supports: tuple[NDArray[np.intp], ...], base: int) -> Information:
-    """Return information that holds no equations, to merge others into."""
+def empty_information(joint_supports: tuple[NDArray[np.intp], ...], base_count: int) -> Information:
+    """Return information of `base_count` base parameters that holds no equations, to merge others into."""
     factors = tuple(np.zeros((0, len(support) + 1)) for support in joint_supports)
-    return Information(joint_supports, factors, np.zeros(len(joint_supports), dtype=np.int64), base)
+    return Information(joint_supports, factors, np.zeros(len(joint_supports), dtype=np.int64), base_count)
 
 
 def information_of(
     H_b: Array,
     torque: Array,
-    keep: NDArray[np.bool_],
+    equation_mask: NDArray[np.bool_],
     joint_supports: tuple[NDArray[np.intp], ...],
     row_weights: Array | None = None,
 ) -> Information:
@@ -196,17 +196,17 @@ def information_of(
     Args:
         H_b: base regressor, shape (joints, base, samples).
         torque: [N m or N], shape (samples, joints).
-        keep: mask of the equations that count, shape (samples, joints).
+        equation_mask: mask of the equations that count, shape (samples, joints).
         joint_supports: result of `sparsity`.
         row_weights: factors of the equations, shape (samples, joints); ones when None.
     """
     factors = []
     for joint, support in enumerate(joint_supports):
-        mask = keep[:, joint]
+        mask = equation_mask[:, joint]
         rows = np.empty((int(mask.sum()), len(support) + 1), order="F")
         rows[:, :-1] = H_b[joint, support].T[mask]
         rows[:, -1] = torque[mask, joint]
         if row_weights is not None:
             rows *= row_weights[mask, joint][:, None]
         factors.append(triangle(rows) if len(rows) else rows)
-    return Information(joint_supports, tuple(factors), keep.sum(axis=0).astype(np.int64), H_b.shape[1])
+    return Information(joint_supports, tuple(factors), equation_mask.sum(axis=0).astype(np.int64), H_b.shape[1])

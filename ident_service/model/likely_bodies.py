@@ -62,7 +62,7 @@ def likely_bodies(model: ArmModel) -> LikelyBodies:
         if model.prior is not None and _is_body(model.prior[place]):
             delta[place] = model.prior[place]
             continue
-        rods = config.geometry.get(name) or lines_of(model, link)
+        rods = config.geometry.get(name) or link_rods(model, link)
         parameters = sum((_rod(rod) for rod in rods), np.zeros(len(INERTIAL)))
         joint = config.joints.get(name)
         if joint is not None and joint.body.mass is not None:
@@ -130,7 +130,7 @@ def _drives(model: ArmModel, delta: Array) -> Array:
     return found
 
 
-def lines_of(model: ArmModel, link: int) -> Sequence[Capsule]:
+def link_rods(model: ArmModel, link: int) -> Sequence[Capsule]:
     """Return capsules (rods) from a link's joint to the joints that it carries, else to its frame; in the link's frame.
 
     Args:
@@ -172,14 +172,14 @@ def _is_body(parameters: Array) -> bool:
     return bool(np.linalg.eigvalsh(spread)[0] > 1e-8 * size**2)
 
 
-def perturbed_body(parameters: Array, rng: np.random.Generator) -> Array:
+def perturbed_body(body: Array, rng: np.random.Generator) -> Array:
     """Return a random real body near another one, shape (10,): A P A^T, A near identity, mass within about 10 %.
 
     Args:
-        parameters: of a real body, shape (10,), see `INERTIAL`.
+        body: of a real body, shape (10,), see `INERTIAL`.
         rng: random generator of the draw.
     """
-    P = pseudo_inertia(parameters)
+    P = pseudo_inertia(body)
     size = np.sqrt(np.trace(P[:3, :3]) / P[3, 3])
     A = np.eye(4) + 0.05 * rng.uniform(-1.0, 1.0, size=(4, 4))
     A[:3, 3] *= size

@@ -18,29 +18,29 @@ from typing import Any, Final
 from ident_service.errors import ModelError
 
 
-def own_module(module: str, *words: str) -> tuple[list[str], dict[str, str]]:
+def module_command(module: str, *arguments: str) -> tuple[list[str], dict[str, str]]:
     """Return command and environment to run one of our modules in a new Python interpreter; start nothing.
 
     What this interpreter finds where, the other one finds there too, and never in the working directory first.
     """
     paths = os.pathsep.join(path or str(Path.cwd()) for path in sys.path)
     environment = {**os.environ, "PYTHONPATH": paths, "OPENBLAS_NUM_THREADS": "1"}
-    return [sys.executable, "-P", "-m", module, *words], environment
+    return [sys.executable, "-P", "-m", module, *arguments], environment
 
 
-def run_limited_process(module: str, path: Path, deadline: float, *more: str) -> dict[str, Any]:
+def run_limited_process(module: str, file: Path, timeout: float, *arguments: str) -> dict[str, Any]:
     """Run a module on a file in a limited process and return the JSON object it prints; ModelError if it breaks off.
 
     Args:
-        module: module whose `main` calls `answer_within`.
-        path: of the file.
-        more: further arguments after the file's path.
-        deadline: how long a busy machine may take [s]; the process limits its own computing.
+        module: module whose `main` calls `print_json_within_limits`.
+        file: of the file.
+        arguments: further arguments after the file's path.
+        timeout: how long a busy machine may take [s]; the process limits its own computing.
 
     Raises:
         ModelError: it takes too long or breaks off; without the file's name.
     """
-    command, environment = own_module(module, str(path), *more)
+    command, environment = module_command(module, str(file), *arguments)
     try:
         done = subprocess.run(  # noqa: S603 - our own interpreter and module
             command,
@@ -48,11 +48,11 @@ def run_limited_process(module: str, path: Path, deadline: float, *more: str) ->
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             env=environment,
-            timeout=deadline,
+            timeout=timeout,
             check=False,
         )
     except subprocess.TimeoutExpired:
-        raise ModelError(f"could not be read and judged within {deadline:g} s; give a smaller one") from None
+        raise ModelError(f"could not be read and judged within {timeout:g} s; give a smaller one") from None
     if done.returncode == 0:
         answer: dict[str, Any] = json.loads(done.stdout)
         return answer
@@ -78,31 +78,31 @@ def end_with_input() -> None:
     threading.Thread(target=wait, name="input", daemon=True).start()
 
 
-def end_with_parent(parent: int) -> None:
+def end_with_parent(parent_pid: int) -> None:
     """Have the kernel kill this process (SIGKILL) when the thread that started it ends; exit if it has ended.
 
     Args:
-        parent: id of the process that started this one; if that is gone already, this one ends at once.
+        parent_pid: id of the process that started this one; if that is gone already, this one ends at once.
     """
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-    if os.getppid() != parent:
+    if os.getppid() != parent_pid:
         os._exit(1)
 
 
-def answer_within(memory: int, seconds: int, document: Callable[[], dict[str, Any]]) -> int:
-    """Limit memory and computing time of this process, print `document()` as JSON alone, and return 0.
+def print_json_within_limits(max_bytes: int, max_seconds: int, make_document: Callable[[], dict[str, Any]]) -> int:
+    """Limit memory and computing time of this process, print the JSON of `make_document()`, and return 0.
 
     Args:
-        memory: bytes of addresses that it may have, libraries included.
-        seconds: largest computing time [s].
-        document: function without arguments that returns a JSON object.
+        max_bytes: bytes of addresses that it may have, libraries included.
+        max_seconds: largest computing time [s].
+        make_document: function without arguments that returns a JSON object.
     """
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
-    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
+    resource.setrlimit(resource.RLIMIT_AS, (max_bytes, max_bytes))
+    resource.setrlimit(resource.RLIMIT_CPU, (max_seconds, max_seconds + 1))
     answer = os.dup(1)
     os.dup2(2, 1)
-    text = json.dumps(document()).encode()
+    text = json.dumps(make_document()).encode()
     with os.fdopen(answer, "wb") as out:
         out.write(text)
     return 0

@@ -75,14 +75,16 @@ class Mechanism:
     frames: Mapping[str, tuple[int, Array, Array]]
 
 
-def read_mechanism(file: TextFile, kind: Kind, kinematics: Kinematics | None = None, *, own: bool = False) -> Mechanism:
+def read_mechanism(
+    file: TextFile, kind: Kind, kinematics: Kinematics | None = None, *, trusted: bool = False
+) -> Mechanism:
     """Read the arm's mechanism from URDF or MJCF text; raises ModelError where it is refused or has no such part.
 
     Args:
         file: name and text of the file.
         kind: of the file.
         kinematics: part of the file that is the arm; all of it when None.
-        own: whether this process has just written the file, so that its content is not foreign.
+        trusted: whether this process has just written the file, so that its content is not foreign.
 
     Raises:
         ModelError: not such a file, beyond the limits, entities or includes in it, or a joint that is neither
@@ -91,7 +93,7 @@ def read_mechanism(file: TextFile, kind: Kind, kinematics: Kinematics | None = N
     part = None
     if kinematics is not None:
         part = json.dumps({"base": kinematics.base, "tip": kinematics.tip, "lock": kinematics.lock})
-    return _read(file, kind, part, own)
+    return _read(file, kind, part, trusted)
 
 
 @lru_cache(maxsize=8)

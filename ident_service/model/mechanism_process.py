@@ -23,7 +23,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from ident_service.errors import ModelError
-from ident_service.model.limited_process import answer_within
+from ident_service.model.limited_process import print_json_within_limits
 from ident_service.model.plain_mjcf import bodies_of_meshes, build_from_mjcf, mjcf_gravity, plain_mjcf
 from ident_service.model.xml_elements import parse_xml
 
@@ -209,13 +209,13 @@ _SUPPORTED = ("JointModelR", "JointModelP")
 _UNSUPPORTED = ("JointModelPlanar",)
 
 
-def urdf_document(file: TextFile, part: str | None) -> dict[str, Any]:
-    """Return the arm of a URDF as JSON values, or an `error`; `part`: JSON of `base`, `tip`, `lock`, None for all."""
-    return _document("URDF", lambda: pin.buildModelFromXML(file.text), part or "{}", lambda: mimics(file))
+def urdf_document(file: TextFile, selection_json: str | None) -> dict[str, Any]:
+    """Read a URDF in this process; return its mechanism as JSON values, or an `error`; all of it without selection."""
+    return _document("URDF", lambda: pin.buildModelFromXML(file.text), selection_json or "{}", lambda: mimics(file))
 
 
-def mjcf_document(path: str, part: str | None) -> dict[str, Any]:
-    """Return the arm of an MJCF, alone in its folder, as JSON values, or its `error`; `part` is as for a URDF."""
+def mjcf_document(path: str, selection_json: str | None) -> dict[str, Any]:
+    """Read an MJCF in this process; return its mechanism as JSON values, or an `error`; writes a copy beside it."""
     text, unknown = Path(path).read_text(encoding="utf-8-sig"), set[str]()
 
     def build() -> pin.Model:
@@ -224,7 +224,7 @@ def mjcf_document(path: str, part: str | None) -> dict[str, Any]:
         unknown.update(bodies_of_meshes(plain_mjcf(text)))
         return model
 
-    return _document("MJCF", build, part, dict, unknown)
+    return _document("MJCF", build, selection_json, dict, unknown)
 
 
 def delta_from_inertia(inertia: pin.Inertia) -> NDArray[np.float64]:
@@ -293,9 +293,11 @@ def _document(
     }
 
 
-def main(words: list[str]) -> int:
+def main(arguments: list[str]) -> int:
     """Read one MJCF file, within limits of memory and time, and print its mechanism as JSON; return 0."""
-    return answer_within(MOST_MEMORY, MOST_SECONDS, lambda: mjcf_document(words[0], words[1] if words[1:] else None))
+    return print_json_within_limits(
+        MOST_MEMORY, MOST_SECONDS, lambda: mjcf_document(arguments[0], arguments[1] if arguments[1:] else None)
+    )
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ def to_vector(values: Array) -> Vector:
 
 
 def turned(placement: Array, axis: Array, c: Symbol, s: Symbol) -> Rotation:
-    """Return the rotation from the parent's frame into the turned joint frame, as rows of symbolic values."""
+    """Return the rotation into a joint frame turned by the angle of cosine `c` and sine `s`, as symbolic rows."""
     x, y, z = (float(component) for component in axis)
     K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     still, sine, cosine = placement @ (np.eye(3) + K @ K), placement @ K, -(placement @ (K @ K))

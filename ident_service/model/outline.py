@@ -33,7 +33,7 @@ from ident_service.config.quantities import MAX_FILE_BYTES, Angle, TextFile
 from ident_service.config.yaml_source import read_without_base
 from ident_service.errors import ConfigError, ModelError, Problem, UsageError
 from ident_service.model.chain import WORLD, Array, Chain
-from ident_service.model.limited_process import answer_within, run_limited_process
+from ident_service.model.limited_process import print_json_within_limits, run_limited_process
 from ident_service.model.mechanism import read_mechanism, require_parser_limits, require_urdf
 from ident_service.model.plain_mjcf import build_from_mjcf
 from ident_service.model.solids import Capsule as Pill
@@ -440,18 +440,18 @@ def _find(name: str, folder: Path) -> Path | None:
     return None
 
 
-def capsules_around(corners: Array) -> list[Capsule]:
+def capsules_around(triangles: Array) -> list[Capsule]:
     """Return capsules that enclose triangles: one, or up to four where these take clearly less space.
 
     Args:
-        corners: of the triangles [m], shape (triangles, 3, 3).
+        triangles: of the triangles [m], shape (triangles, 3, 3).
     """
-    if not len(corners):
+    if not len(triangles):
         return []
-    extent = float(np.ptp(corners.reshape(-1, 3), axis=0).max())
+    extent = float(np.ptp(triangles.reshape(-1, 3), axis=0).max())
     # Each corner once: else those of many triangles would turn the axes.
-    whole = capsule_around(np.unique(corners.reshape(-1, 3), axis=0))
-    parts = [(_divided(corners, extent / _FINE), whole)]
+    whole = capsule_around(np.unique(triangles.reshape(-1, 3), axis=0))
+    parts = [(_divided(triangles, extent / _FINE), whole)]
     grid = extent / _GRID if len(parts[0][0]) > _MANY else 0.0
     if grid:  # corners move by at most half of its diagonal, which is added to each radius
         cells = np.unique(np.round(parts[0][0] / grid).astype(int).reshape(-1, 9), axis=0)
@@ -800,9 +800,11 @@ def _surface(solid: Any) -> Array | None:
     return _hull(np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]))
 
 
-def main(words: list[str]) -> int:
+def main(arguments: list[str]) -> int:
     """Read the outline of one MJCF, within limits of memory and time, and print it as JSON; return 0."""
-    return answer_within(_MOST_MEMORY, _MOST_SECONDS, lambda: _mjcf_document(Path(words[0]), Path(words[1])))
+    return print_json_within_limits(
+        _MOST_MEMORY, _MOST_SECONDS, lambda: _mjcf_document(Path(arguments[0]), Path(arguments[1]))
+    )
 
 
 if __name__ == "__main__":

@@ -57,15 +57,15 @@ def inertia_matrix(parameters: Array) -> Array:
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
-def body_parameters(inertia: Array, first: Array, mass: float) -> Array:
-    """Return the ten parameters of a body (eq. 13), shape (10,), in the order of `INERTIAL`.
+def body_parameters(inertia: Array, first_moment: Array, mass: float) -> Array:
+    """Return a body's ten parameters (eq. 13), shape (10,), from inertia about its origin, first moment m c and mass.
 
     Args:
         inertia: inertia about the frame's origin [kg m^2], shape (3, 3).
-        first: mass times centre of mass [kg m], shape (3,).
+        first_moment: mass times centre of mass [kg m], shape (3,).
         mass: mass of the body [kg].
     """
-    return np.array([*inertia[np.triu_indices(3)], *first, mass])
+    return np.array([*inertia[np.triu_indices(3)], *first_moment, mass])
 
 
 def pseudo_inertia(parameters: Array) -> Array:
@@ -148,7 +148,7 @@ class Layout:
         return tuple(units)
 
     def inertial(self, link: int) -> slice:
-        """Return the slice of delta with the ten inertial parameters of `link` (counted from 0)."""
+        """Return the slice of the link parameters with the ten inertial ones of `link` (counted from 0)."""
         start = link * self.per_link
         return slice(start, start + len(INERTIAL))
 
@@ -159,23 +159,23 @@ class Layout:
         return np.arange(self.joints) * self.per_link + len(INERTIAL) + self.terms.index(term)
 
     def term_values(self, term: JointTerm, delta: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the values of one joint term in `delta`, shape (joints,), zero where the model has no such term."""
+        """Return one joint term's values in link parameters `delta`, shape (joints,); zero if the model lacks it."""
         columns = self.term_columns(term)
         return delta[columns] if len(columns) else np.zeros(self.joints)
 
-    def vector(self, table: ParameterTable) -> NDArray[np.float64]:
-        """Return delta from named values, shape (size,); names that are not given are zero.
+    def vector(self, named_values: ParameterTable) -> NDArray[np.float64]:
+        """Return the link parameters delta from named values, shape (size,); names that are not given are zero.
 
         Raises:
             ParameterError: names that this arm does not have.
         """
         index = {name: column for column, name in enumerate(self.names)}
-        if unknown := [name for name in table.names if name not in index]:
+        if unknown := [name for name in named_values.names if name not in index]:
             raise ParameterError(
                 f"parameters this arm does not have: {', '.join(unknown)}; it has {self.names[0]} ... {self.names[-1]}"
             )
         delta = np.zeros(self.size)
-        for name, value in zip(table.names, table.values, strict=True):
+        for name, value in zip(named_values.names, named_values.values, strict=True):
             delta[index[name]] = value
         return delta
 
@@ -211,7 +211,7 @@ def own_drives(chain: Chain) -> NDArray[np.bool_]:
 
 
 def joint_drives(chain: Chain, layout: Layout, delta: Array) -> JointDrives:
-    """Return inertia, damping and dry friction that each joint's own drive adds to it; zero for shared drives.
+    """Return inertia, damping and dry friction, of link parameters `delta`, of each joint's own drive; zero for shared.
 
     Args:
         chain: the mechanism.

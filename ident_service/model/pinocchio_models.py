@@ -87,7 +87,7 @@ def link_frame(chain: Chain, link: int) -> pin.SE3:
 
 
 def pinocchio_model(chain: Chain, layout: Layout, delta: Array) -> pin.Model:
-    """Build a pinocchio model of `delta`, with armature, without friction; ModelError for coupled drives or no mass.
+    """Build a pinocchio model of link parameters `delta`, frictionless; ModelError for coupled drives or no mass.
 
     Every joint has one position coordinate, continuous joints too. Friction stays with whoever integrates, because
     pinocchio's has no sticking.

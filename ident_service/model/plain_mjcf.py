@@ -31,25 +31,27 @@ _MASSLESS: Final = {"pos": "0 0 0", "mass": "0", "diaginertia": "0 0 0"}
 _UNWRITTEN: Final = ("replicate", "attach", "composite", "flexcomp")  # elements that MuJoCo makes bodies of
 
 
-def build_from_mjcf(path: Path, folder: Path, build: Callable[[str], Any], meshes: Path | None = None) -> Any:
-    """Write an MJCF, rewritten for pinocchio's reader, into a folder; return what `build` makes of that file.
+def build_from_mjcf(
+    path: Path, output_folder: Path, read_file: Callable[[str], Any], mesh_folder: Path | None = None
+) -> Any:
+    """Write an MJCF, rewritten for pinocchio's reader, into a folder; return what `read_file` makes of that file.
 
     Args:
         path: of an MJCF that has passed `require_parser_limits`.
-        folder: folder for the rewritten file. Its owner removes it: what reads the file may break off.
-        build: called with the path of that file.
-        meshes: folder that the file's own names of meshes begin in; none are read when None.
+        output_folder: folder for the rewritten file. Its owner removes it: what reads the file may break off.
+        read_file: called with the path of that file.
+        mesh_folder: folder that the file's own names of meshes begin in; none are read when None.
 
     Raises:
         ModelError: what pinocchio would misread and is not rewritten.
     """
-    text = plain_mjcf(path.read_text(encoding="utf-8-sig", errors="surrogatepass"), meshes)
-    plain = folder / f"plain {path.name}"
+    text = plain_mjcf(path.read_text(encoding="utf-8-sig", errors="surrogatepass"), mesh_folder)
+    plain = output_folder / f"plain {path.name}"
     plain.write_text(text, encoding="utf-8")
-    return build(str(plain))
+    return read_file(str(plain))
 
 
-def plain_mjcf(text: str, meshes: Path | None = None) -> str:
+def plain_mjcf(text: str, mesh_folder: Path | None = None) -> str:
     """Return an MJCF rewritten in radians, without classes and frames; raises ModelError for what cannot be."""
     root = parse_xml(text)
     if root.tag != "mujoco":
@@ -72,8 +74,8 @@ def plain_mjcf(text: str, meshes: Path | None = None) -> str:
     compiler.set("angle", "radian")
     if (order := compiler.get("eulerseq", "xyz")).isupper():
         compiler.set("eulerseq", order[::-1].lower())
-    if meshes is not None:
-        compiler.set("meshdir", str(meshes.absolute() / compiler.get("meshdir", compiler.get("assetdir", ""))))
+    if mesh_folder is not None:
+        compiler.set("meshdir", str(mesh_folder.absolute() / compiler.get("meshdir", compiler.get("assetdir", ""))))
     return ET.tostring(root, encoding="unicode")
 
 

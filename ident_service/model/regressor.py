@@ -122,7 +122,7 @@ def traced_rigid_torque(
     dq: Sequence[Value],
     ddq: Sequence[Value],
 ) -> list[Value]:
-    """Return symbolic torques of the links for known parameters, without drives and friction, one per joint."""
+    """Return the links' symbolic joint torques for known link parameters `delta`, without drives and friction."""
     torque: list[Value] = [0.0] * chain.joints
     states = _Forward(tape, chain, q, dq, ddq)
     for link in range(chain.joints):

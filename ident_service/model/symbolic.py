@@ -178,16 +178,16 @@ class Program:
             output[row][...] = value
 
 
-def operands_of(tape: ExpressionGraph, at: int) -> list[int]:
-    """Return the indices of the earlier steps that a step is computed from; empty for inputs and constants."""
-    operation, a, b = tape.steps[at]
+def operands_of(tape: ExpressionGraph, step: int) -> list[int]:
+    """Return the indices of the earlier steps that the step with this index is computed from; [] for an input."""
+    operation, a, b = tape.steps[step]
     return [] if operation == "input" else [value for value in (a, b) if isinstance(value, int)]
 
 
-def needed_steps(tape: ExpressionGraph, wanted: list[int]) -> list[int]:
-    """Return the indices of all steps that the wanted ones depend on, themselves included, increasing."""
+def needed_steps(tape: ExpressionGraph, results: list[int]) -> list[int]:
+    """Return the indices of all steps that the steps `results` depend on, themselves included, increasing."""
     found: set[int] = set()
-    waiting = list(wanted)
+    waiting = list(results)
     while waiting:
         at = waiting.pop()
         if at not in found:
@@ -362,24 +362,24 @@ class TaylorModel:
     h: Array
 
     @property
-    def reach(self) -> Array:
+    def deviation_bound(self) -> Array:
         """Return a bound of the value's distance from its middle `c` over each time interval."""
         return np.asarray(np.abs(self.d) * self.h + self.r)
 
     @property
     def size(self) -> Array:
         """Return an upper bound of `|x|` over each time interval."""
-        return np.asarray((np.abs(self.c) + self.reach) * (1.0 + _ROUNDING))
+        return np.asarray((np.abs(self.c) + self.deviation_bound) * (1.0 + _ROUNDING))
 
     @property
     def highest(self) -> Array:
         """Return an upper bound of x over each time interval."""
-        return np.asarray(self.c + self.reach + _ROUNDING * np.abs(self.c))
+        return np.asarray(self.c + self.deviation_bound + _ROUNDING * np.abs(self.c))
 
     @property
     def lowest(self) -> Array:
         """Return a lower bound of x over each time interval."""
-        return np.asarray(self.c - self.reach - _ROUNDING * np.abs(self.c))
+        return np.asarray(self.c - self.deviation_bound - _ROUNDING * np.abs(self.c))
 
     def __add__(self, other: TaylorModel) -> TaylorModel:
         return TaylorModel(self.c + other.c, self.d + other.d, self.r + other.r, self.h)
@@ -405,7 +405,7 @@ class TaylorModel:
 
     def function(self, name: str) -> TaylorModel:
         """Return the enclosure of `sin`, `cos`, `exp`, `abs`, `sign` or `neg` of this value."""
-        reach = self.reach
+        reach = self.deviation_bound
         if name == "neg":
             return -self
         if name in ("sin", "cos"):

@@ -29,7 +29,7 @@ BASE_LINK = "base_link"
 
 
 def urdf_text(model: ArmModel, delta: Array | None, visible: Sequence[Body] = ()) -> str:
-    """Return the arm as URDF text: kinematics and limits, inertias of `delta`, and solids to draw.
+    """Return the arm as URDF text: kinematics, limits, inertias of link parameters `delta`, if any, solids to draw.
 
     Args:
         model: the mechanism and its limits.
@@ -166,13 +166,13 @@ def roll_pitch_yaw(rotation: Array) -> Array:
     return np.array([roll, pitch, yaw])
 
 
-def urdf_solids(kinematics: Kinematics, chain: Chain, skip: frozenset[str]) -> list[Body]:
-    """Return the collision solids of a URDF's arm and base links not in `skip`; [] without URDF, ModelError for a mesh.
+def urdf_solids(kinematics: Kinematics, chain: Chain, skipped_owners: frozenset[str]) -> list[Body]:
+    """Return the collision solids of a URDF's links not in `skipped_owners`; [] without URDF, ModelError for a mesh.
 
     Args:
         kinematics: the URDF that the chain was read from, and which part of it is the arm.
         chain: the mechanism.
-        skip: joint names (or `base`) of links whose geometry is known from elsewhere.
+        skipped_owners: joint names (or `base`) of links whose geometry is known from elsewhere.
 
     Raises:
         ModelError: a mesh, or a shape or number that cannot be read, in a link that is not skipped.
@@ -192,7 +192,7 @@ def urdf_solids(kinematics: Kinematics, chain: Chain, skip: frozenset[str]) -> l
             continue
         joint, rotation, translation = frame
         owner = BASE if joint == WORLD else chain.names[joint]
-        if owner in skip:
+        if owner in skipped_owners:
             continue
         where = f"{file.name}: link {link.get('name')!r}"
         for element in elements:
@@ -202,42 +202,45 @@ def urdf_solids(kinematics: Kinematics, chain: Chain, skip: frozenset[str]) -> l
     return bodies
 
 
-def solid_of(collision: ET.Element, rotation: Array, center: Array, owner: str, where: str) -> Solid:
+def solid_of(collision_element: ET.Element, rotation: Array, center: Array, owner: str, error_prefix: str) -> Solid:
     """Return the solid of a URDF's collision element at a placement in its joint's frame; raises for a mesh.
 
     Raises:
         ModelError: a mesh, or a shape or number that cannot be read.
     """
-    geometry = collision.find("geometry")
+    geometry = collision_element.find("geometry")
     shape = next(iter(geometry), None) if geometry is not None else None
     if shape is None:
-        raise ModelError(f"{where}: a collision element without geometry")
+        raise ModelError(f"{error_prefix}: a collision element without geometry")
     if shape.tag == "mesh":
         raise ModelError(
-            f"{where}: its collision geometry is a mesh, which is not supported; "
+            f"{error_prefix}: its collision geometry is a mesh, which is not supported; "
             f"give capsules for {owner!r} under geometry"
         )
     if shape.tag == "box":
-        return Box(rotation, center, 0.5 * np.array(_sizes(shape.get("size"), 3, where)))
+        return Box(rotation, center, 0.5 * np.array(_sizes(shape.get("size"), 3, error_prefix)))
     if shape.tag == "sphere":
-        (radius,) = _sizes(shape.get("radius"), 1, where)
+        (radius,) = _sizes(shape.get("radius"), 1, error_prefix)
         return Capsule(center, center, radius)
     if shape.tag in ("cylinder", "capsule"):
-        (radius,), (length,) = _sizes(shape.get("radius"), 1, where), _sizes(shape.get("length"), 1, where)
+        (radius,), (length,) = (
+            _sizes(shape.get("radius"), 1, error_prefix),
+            _sizes(shape.get("length"), 1, error_prefix),
+        )
         if shape.tag == "cylinder":
             return Cylinder(rotation, center, radius, 0.5 * length)
         along = 0.5 * length * rotation[:, 2]
         return Capsule(center - along, center + along, radius)
-    raise ModelError(f"{where}: collision geometry {shape.tag!r} is none of box, sphere, cylinder, capsule")
+    raise ModelError(f"{error_prefix}: collision geometry {shape.tag!r} is none of box, sphere, cylinder, capsule")
 
 
-def origin_of(origin: ET.Element | None, where: str) -> tuple[Array, Array]:
+def origin_of(origin_element: ET.Element | None, error_prefix: str) -> tuple[Array, Array]:
     """Return rotation and translation [m] of an `<origin>`, the identity without one; ModelError if unreadable."""
-    if origin is None:
+    if origin_element is None:
         return np.eye(3), np.zeros(3)
     return (
-        rotation_rpy(*_attribute_numbers(origin.get("rpy", "0 0 0"), 3, where)),
-        np.array(_attribute_numbers(origin.get("xyz", "0 0 0"), 3, where)),
+        rotation_rpy(*_attribute_numbers(origin_element.get("rpy", "0 0 0"), 3, error_prefix)),
+        np.array(_attribute_numbers(origin_element.get("xyz", "0 0 0"), 3, error_prefix)),
     )
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-def low_pass(values: Array, order: int, cutoff: float, rate: float, pad: int | None = None) -> Array:
+def low_pass(values: Array, order: int, cutoff: float, rate: float, pad_samples: int | None = None) -> Array:
     """Filter every column both ways with a Butterworth low-pass, so without phase; same shape; ValueError if too short.
 
     Each end is continued by its odd reflection, and the filter begins in the steady state of the first value, as
@@ -28,24 +28,24 @@ def low_pass(values: Array, order: int, cutoff: float, rate: float, pad: int | N
         order: of the filter that runs in one direction.
         cutoff: [Hz], where one direction has -3 dB and both have -6 dB.
         rate: of the samples [Hz].
-        pad: samples of reflection, at most one less than there are; three times the order plus one when None.
+        pad_samples: samples of reflection, at most one less than there are; three times the order plus one when None.
 
     Returns:
         Shape of `values`.
 
     Raises:
-        ValueError: a cut-off that is not between zero and half the rate, or no more samples than `pad`.
+        ValueError: a cut-off that is not between zero and half the rate, or no more samples than `pad_samples`.
     """
     sections = butterworth_sections(order, cutoff, rate)
-    pad = 3 * (2 * (order // 2) + order % 2 + 1) if pad is None else pad
-    if len(values) <= pad:
-        raise ValueError(f"{len(values)} samples are not more than the {pad} of a reflection")
+    pad_samples = 3 * (2 * (order // 2) + order % 2 + 1) if pad_samples is None else pad_samples
+    if len(values) <= pad_samples:
+        raise ValueError(f"{len(values)} samples are not more than the {pad_samples} of a reflection")
     columns = np.asarray(values, dtype=float).reshape(len(values), -1)
-    before = 2.0 * columns[:1] - columns[pad:0:-1]
-    after = 2.0 * columns[-1:] - columns[-2 : -pad - 2 : -1]
+    before = 2.0 * columns[:1] - columns[pad_samples:0:-1]
+    after = 2.0 * columns[-1:] - columns[-2 : -pad_samples - 2 : -1]
     extended = np.concatenate([before, columns, after])
     both = _one_way(_one_way(extended, sections)[::-1], sections)[::-1]
-    return np.ascontiguousarray(both[pad : pad + len(columns)]).reshape(values.shape)
+    return np.ascontiguousarray(both[pad_samples : pad_samples + len(columns)]).reshape(values.shape)
 
 
 def butterworth_sections(order: int, cutoff: float, rate: float) -> list[tuple[float, float, float]]:
@@ -90,14 +90,14 @@ def _one_way(columns: Array, sections: list[tuple[float, float, float]]) -> Arra
     return np.asarray(signal + first)
 
 
-def local_polynomial(values: Array, length: int, degree: int, derivative: int, period: float) -> Array:
+def local_polynomial(values: Array, window_samples: int, degree: int, derivative: int, period: float) -> Array:
     """Return the `derivative` (0: the value) of polynomials fitted to a window around each sample (Savitzky-Golay).
 
     The first and last half window belong to the polynomials of the first and last whole window.
 
     Args:
-        values: shape (samples, ...), at least `length` samples.
-        length: samples of a window, odd and more than `degree`.
+        values: shape (samples, ...), at least `window_samples` samples.
+        window_samples: samples of a window, odd and more than `degree`.
         degree: of the polynomial.
         derivative: order of the derivative, 0 for the value itself.
         period: of the samples [s].
@@ -108,9 +108,9 @@ def local_polynomial(values: Array, length: int, degree: int, derivative: int, p
     Raises:
         ValueError: fewer samples than a window, or a window that is even or not longer than the degree.
     """
-    if length % 2 == 0 or length <= degree or len(values) < length:
-        raise ValueError(f"a window of {length} samples for degree {degree} does not fit {len(values)} samples")
-    half = length // 2
+    if window_samples % 2 == 0 or window_samples <= degree or len(values) < window_samples:
+        raise ValueError(f"a window of {window_samples} samples for degree {degree} does not fit {len(values)} samples")
+    half = window_samples // 2
     # Columns are powers of the place in the window, scaled to at most one: rows of the inverse are Taylor coefficients.
     place = np.arange(-half, half + 1) / half if half else np.zeros(1)
     to_coefficients = np.linalg.pinv(np.vander(place, degree + 1, increasing=True))
@@ -124,41 +124,41 @@ def local_polynomial(values: Array, length: int, degree: int, derivative: int, p
     columns = np.asarray(values, dtype=float).reshape(len(values), -1)
     middle = at(place[half : half + 1])[0]
     inner = np.column_stack([np.correlate(column, middle) for column in columns.T])
-    first, last = at(place[:half]) @ columns[:length], at(place[half + 1 :]) @ columns[-length:]
+    first, last = at(place[:half]) @ columns[:window_samples], at(place[half + 1 :]) @ columns[-window_samples:]
     return np.concatenate([first, inner, last]).reshape(values.shape)
 
 
 _SPLINE_REACH = 12  # samples, after which a value counts for a ten-millionth in a cubic spline
 
 
-def spline_shifted(values: Array, steps: float) -> Array:
-    """Return samples read `steps` (a fraction too) samples later, by a cubic spline; ends keep their values.
+def spline_shifted(values: Array, shift_samples: float) -> Array:
+    """Return values read `shift_samples` (a fraction too) samples later, by a cubic spline; ends keep their values.
 
     Args:
         values: shape (samples, columns), at least one sample.
-        steps: number of samples further on at which the spline is read; negative for back.
+        shift_samples: number of samples further on at which the spline is read; negative for back.
 
     Returns:
         Shape of `values`.
     """
     from scipy.linalg.lapack import dgtsv  # loads for 0.2 s, as above
 
-    pad = _SPLINE_REACH + math.ceil(abs(steps))
+    pad = _SPLINE_REACH + math.ceil(abs(shift_samples))
     knots = np.pad(values, ((pad, pad), (0, 0)), mode="edge")
     # B-splines of a sixth, four sixths and a sixth at their knots, mirrored at the ends.
     before, after = np.ones(len(knots) - 1), np.ones(len(knots) - 1)
     before[-1] = after[0] = 2.0
     *_, coefficients, _ = dgtsv(before, np.full(len(knots), 4.0), after, knots)
-    t = steps - math.floor(steps)
+    t = shift_samples - math.floor(shift_samples)
     weights = (1.0 - t) ** 3, 3.0 * t**3 - 6.0 * t**2 + 4.0, 1.0 + 3.0 * (t + t**2 - t**3), t**3
-    first = pad + math.floor(steps) - 1
+    first = pad + math.floor(shift_samples) - 1
     shifted = np.zeros(values.shape)
     for place, weight in enumerate(weights, first):
         shifted += weight * coefficients[place : place + len(values)]
     return shifted
 
 
-def widened(marks: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
-    """Return a mask of the samples at most `reach` samples from one marked in `marks`, shape (samples, columns)."""
-    counts = np.cumsum(np.pad(marks, ((reach + 1, reach), (0, 0))), axis=0)
-    return np.asarray(counts[2 * reach + 1 :] > counts[: len(marks)])
+def widened(mask: NDArray[np.bool_], samples: int) -> NDArray[np.bool_]:
+    """Return a mask of all within `samples` samples of one that `mask` marks, shape (samples, columns)."""
+    counts = np.cumsum(np.pad(mask, ((samples + 1, samples), (0, 0))), axis=0)
+    return np.asarray(counts[2 * samples + 1 :] > counts[: len(mask)])

@@ -436,7 +436,7 @@ class SafetyMonitor:
         size = np.abs(computed_torque)
         if (
             all((size <= limit).tolist())
-            and (motors is None or all((motors.used(computed_torque) <= 1.0).tolist()))
+            and (motors is None or all((motors.torque_shares(computed_torque) <= 1.0).tolist()))
             and (before is None or all((np.abs(computed_torque - before) <= self.rate).tolist()))
         ):
             self._sent = computed_torque
@@ -454,11 +454,11 @@ class SafetyMonitor:
         if over.any():
             what = "a torque of {} {f} was requested, the limit is {}"
             fault = self._found(Check("torque_saturated", over, what, (computed_torque, limit)))
-        if motors is not None and (over := motors.used(leaves) > 1.0).any():
+        if motors is not None and (over := motors.torque_shares(leaves) > 1.0).any():
             what = "a torque of {} N m was requested, the limit is {}"
             asked = leaves @ motors.to_motors.T
             fault = self._found(Check("torque_saturated", over, what, (asked, motors.torque), motors.names))
-            leaves = motors.limited(leaves)
+            leaves = motors.scaled_within(leaves)
         if before is not None and (fast := np.abs(leaves - before) > self.rate).any():
             change = (leaves - before) / self._period
             what = "the torque was to change by {} {f}/s, {} allowed"

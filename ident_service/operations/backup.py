@@ -162,7 +162,7 @@ def restore(backup_file: Path, state: Path, who: str, *, replace: bool = False) 
         try:
             head, files, size = _extract(backup_file, staging)
             with Database(staging) as db:
-                if not db.sound():
+                if not db.is_intact():
                     raise UsageError(f"{backup_file}: its registry is damaged; use another backup")
                 revoke_first_tokens(db, who)  # whose file stays behind; the next start makes another one
                 note(db, who, "restored", "state folder", created=head["created"], software=head["software"])

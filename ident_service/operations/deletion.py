@@ -19,12 +19,12 @@ from typing import Final, Literal
 from ident_service.errors import Dependent, DriverError, InUse, UsageError
 from ident_service.motion.command_channel import ControlFile
 from ident_service.operations.maintenance_schedule import remove_schedule
-from ident_service.registry.arms import DESCRIPTIONS, know_shipped
+from ident_service.registry.arms import DESCRIPTIONS, register_shipped_arms
 from ident_service.registry.database import Database, Row, note
 from ident_service.registry.jobs import LIVE
 from ident_service.registry.motions import MOTIONS, known_motion
 from ident_service.registry.runs import REPORTS, RUNS, known_run
-from ident_service.registry.state_folder import arm_folder, control_path, fault_file
+from ident_service.registry.state_folder import arm_fault_store, arm_folder, control_path
 
 _GONE: Final = ".deleted"
 _PLACES: Final = (RUNS, MOTIONS, DESCRIPTIONS, "arms")
@@ -85,7 +85,7 @@ def delete_arm(db: Database, state: Path, arm: str, who: str, *, anyway: bool = 
     live = db.rows(f"SELECT id FROM jobs WHERE arm = ? AND state IN {LIVE}", arm)  # noqa: S608 - ours
     live += db.rows("SELECT id FROM reidentifications WHERE arm = ? AND state = 'running'", arm)
     _require_idle(f"the arm {arm}", [one["id"] for one in live])
-    if faults := fault_file(state, arm).latched():
+    if faults := arm_fault_store(state, arm).latched():
         raise InUse(f"the arm {arm} has unacknowledged faults: {', '.join(faults)}")
     runs = db.rows("SELECT * FROM runs WHERE arm = ? ORDER BY id", arm)
     motions = db.rows("SELECT * FROM motions WHERE arm = ? ORDER BY id", arm)
@@ -116,7 +116,7 @@ def delete_arm(db: Database, state: Path, arm: str, who: str, *, anyway: bool = 
                 db.write(f"DELETE FROM {table} WHERE arm = ?", arm)  # noqa: S608 - ours
             db.write("DELETE FROM arms WHERE name = ?", arm)
             note(db, who, "arm deleted", arm, with_it=[asdict(one) for one in found[:100]])
-            know_shipped(db)
+            register_shipped_arms(db)
     return found
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from drivers.can.bus_load import Budget
 from ident_service.config.arm import ArmConfig, Joint
-from ident_service.config.load import load_arm, located
+from ident_service.config.load import load_arm, located_problem
 from ident_service.config.motion_limits import NEEDED, motion_limits
 from ident_service.config.quantities import ParameterTable, did_you_mean
 from ident_service.errors import ConfigError, ModelError, MotionRefused, ParameterError, Problem
@@ -82,11 +82,11 @@ def check_description(description: str | Path, *, upload: bool = False) -> Check
     except ParameterError as error:
         names = arm_model(config.model_copy(update={"prior": None, "payload": None})).layout.names
         unknown = list(_name_problems(description, names, config, ("prior",)))
-        problems += unknown or [located(description, ("prior",), f"prior: {error}")]
+        problems += unknown or [located_problem(description, ("prior",), f"prior: {error}")]
     except ModelError as error:
         message = _NAMED.sub("", str(error), count=1)
         where = _place(str(error))
-        raise ConfigError([*problems, located(description, where, f"{'.'.join(where)}: {message}")]) from None
+        raise ConfigError([*problems, located_problem(description, where, f"{'.'.join(where)}: {message}")]) from None
     for where in (("driver", "truth"), ("driver", "emulation", "truth")):
         problems += _name_problems(description, names, config, where)
     if problems or model is None:
@@ -104,24 +104,26 @@ def check_description(description: str | Path, *, upload: bool = False) -> Check
         follows = None if model.prior is None else after_stop(model, limits)
     except MotionRefused as refusal:
         # Its remedies are several keys; the joints are where brakes would stand.
-        objections.append(located(description, ("control", "after_stop"), str(refusal)))
+        objections.append(located_problem(description, ("control", "after_stop"), str(refusal)))
     falling = () if model.prior is None else joints_with_weight(model, limits)
     if model.prior is None and config.driver is not None:
         remedy = "give `prior`, or a URDF or MJCF with the masses of its links"
         objections.append(
-            located(description, ("kinematics",), f"kinematics: computed torque needs a model of the links; {remedy}")
+            located_problem(
+                description, ("kinematics",), f"kinematics: computed torque needs a model of the links; {remedy}"
+            )
         )
     if config.driver is not None:
         try:
             CollisionModel(model)
         except ModelError as error:
-            objections.append(located(description, ("kinematics",), f"kinematics: {error}"))
+            objections.append(located_problem(description, ("kinematics",), f"kinematics: {error}"))
     gains = stability(model, limits, delay_of(model.config))
     for words in gains.objections():
         joint = words.partition(":")[0]
         where = ("joints", joint, "kp") if joint in config.joints else ("control", "rate")
         remedy = "lower kp and kd, or raise control.rate or control.velocity_cutoff"
-        objections.append(located(description, where, f"gains: {words}; {remedy}"))
+        objections.append(located_problem(description, where, f"gains: {words}; {remedy}"))
     return CheckedDescription(model, budget, gains, follows, tuple(objections), (), warnings, falling)
 
 
@@ -132,7 +134,7 @@ def _missing(arm: str | Path, model: ArmModel) -> tuple[Problem, ...]:
         joint = model.config.joints.get(name, Joint())
         if lacking := [key for key in NEEDED if getattr(joint, key) is None]:
             what = f"joints.{name}: a motion needs {', '.join(lacking)}"
-            found.append(located(arm, ("joints", name), f"{what}; `ident new` guesses them from a mechanism"))
+            found.append(located_problem(arm, ("joints", name), f"{what}; `ident new` guesses them from a mechanism"))
     return tuple(found)
 
 
@@ -154,7 +156,7 @@ def _driver_problems(arm: str | Path, config: ArmConfig) -> Iterator[Problem]:
         near = did_you_mean(config.driver.kind, kinds) or "; install the package that brings it, or take one of these"
         known = ", ".join(kinds)
         words = f"driver.kind: no driver is called {config.driver.kind!r}; known: {known}{near}"
-        yield located(arm, ("driver", "kind"), words)
+        yield located_problem(arm, ("driver", "kind"), words)
 
 
 def _place(message: str) -> tuple[str, ...]:
@@ -176,7 +178,7 @@ def _mass_problems(arm: str | Path, config: ArmConfig) -> Iterator[Problem]:
     for name, value in () if table is None else zip(table.names, table.values, strict=True):
         if _MASS.fullmatch(name) and not value > 0.0:
             words = f"prior.{name}: a link's mass is above 0, not {value:g} kg; give the masses of CAD, or no prior"
-            yield located(arm, ("prior", name), words)
+            yield located_problem(arm, ("prior", name), words)
 
 
 def _name_problems(
@@ -190,7 +192,7 @@ def _name_problems(
         if name not in known:
             near = did_you_mean(name, known) or f"; it has {known[0]} ... {known[-1]}"
             words = f"{'.'.join(where)}: parameters this arm does not have: {name}{near}"
-            yield located(arm, (*where, name), words)
+            yield located_problem(arm, (*where, name), words)
 
 
 def description_document(checked: CheckedDescription) -> dict[str, Any]:

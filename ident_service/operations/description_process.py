@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from ident_service.config.quantities import TextFile
 from ident_service.errors import ConfigError, IdentError, ModelError, Problem
-from ident_service.model.limited_process import answer_within, run_limited_process
+from ident_service.model.limited_process import print_json_within_limits, run_limited_process
 from ident_service.registry.arms import DRAWN_LIST
 
 MOST_MEMORY: Final = 2 * 2**30  # bytes of address space
@@ -164,12 +164,14 @@ def _require_own_meshes(source: Path) -> None:
 def main(arguments: list[str]) -> int:
     """Judge, draw or describe the file named first, memory and time of this process bounded; print JSON, return 0."""
     if arguments[1:2] == [_NEW]:
-        return answer_within(MOST_MEMORY, _NEW_SECONDS, lambda: _new_document(Path(arguments[0]), arguments[2]))
+        return print_json_within_limits(
+            MOST_MEMORY, _NEW_SECONDS, lambda: _new_document(Path(arguments[0]), arguments[2])
+        )
     if arguments[1:2] == [_DRAW]:
-        return answer_within(
+        return print_json_within_limits(
             MOST_MEMORY, _NEW_SECONDS, lambda: _drawn_document(*map(Path, (arguments[0], *arguments[2:])))
         )
-    return answer_within(MOST_MEMORY, MOST_SECONDS, lambda: _document(arguments[0]))
+    return print_json_within_limits(MOST_MEMORY, MOST_SECONDS, lambda: _document(arguments[0]))
 
 
 if __name__ == "__main__":

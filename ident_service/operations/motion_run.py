@@ -46,7 +46,7 @@ from ident_service.excitation.trajectory import FourierPath
 from ident_service.model.appearance import visible_bodies
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import base_parameters
-from ident_service.model.limited_process import own_module
+from ident_service.model.limited_process import module_command
 from ident_service.model.urdf import urdf_text
 from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.command_channel import LEASE_SECONDS, ControlFile
@@ -57,7 +57,7 @@ from ident_service.motion.ticket import Ticket, subject_of
 from ident_service.operations.arm_checks import write_ticket
 from ident_service.recordings.files import require_writable
 from ident_service.recordings.recorder import RecorderProcess
-from ident_service.registry.state_folder import arm_folder, fault_file
+from ident_service.registry.state_folder import arm_fault_store, arm_folder
 from ident_service.results.manifest import require_writable_place, write_atomically, write_manifest
 
 _RENEW_SHARE = 0.25  # of the lease
@@ -150,7 +150,7 @@ def supervise_motion_process(
     Raises:
         KeyboardInterrupt: it came before the arm was taken, or the motion process did not end after it.
     """
-    command, environment = own_module("ident_service.motion.process")
+    command, environment = module_command("ident_service.motion.process")
     # A session of its own, so that signals to this process group do not reach it.
     with subprocess.Popen(  # noqa: S603 - our own interpreter and module
         command,
@@ -335,7 +335,7 @@ class TargetMonitor:
 
     def __enter__(self) -> Self:
         """Start the process that follows the recording."""
-        command, environment = own_module("ident_service.operations.target_process")
+        command, environment = module_command("ident_service.operations.target_process")
         self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
             command,
             bufsize=0,
@@ -436,7 +436,7 @@ def run_motion(
         RecordingError: the recording failed, which has stopped the arm.
     """
     requested_ns = time.monotonic_ns() if requested_ns is None else requested_ns
-    faults = fault_file(state, config.name)
+    faults = arm_fault_store(state, config.name)
     faults.require_none(faults.latched())
     if folder.exists():
         raise UsageError(f"{folder}: exists already; give a folder that does not")

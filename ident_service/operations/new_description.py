@@ -29,8 +29,8 @@ from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import ArmModel, arm_model, control_model
 from ident_service.model.base_parameters import base_parameters, remarks_on_angles
 from ident_service.model.chain import Array
-from ident_service.model.collision import CollisionModel, share_touching
-from ident_service.model.likely_bodies import likely_bodies, lines_of, perturbed_body, with_file_bodies
+from ident_service.model.collision import CollisionModel, shares_touching
+from ident_service.model.likely_bodies import likely_bodies, link_rods, perturbed_body, with_file_bodies
 from ident_service.model.mechanism import read_mechanism
 from ident_service.model.outline import FileLimits, Source, arm_capsules, arm_part, read_source
 from ident_service.model.pinocchio_models import InverseDynamics
@@ -520,7 +520,7 @@ def _worst(model: ArmModel, ranges: list[tuple[float, float]]) -> tuple[Array, A
 
 def _guessed_capsules(model: ArmModel, link: int) -> list[Capsule]:
     """Return capsules of a link whose mesh cannot be read; of the last one as far as its body or its tool reaches."""
-    found = list(lines_of(model, link))
+    found = list(link_rods(model, link))
     kinematics = model.config.kinematics
     if len(found) != 1 or found[0].start != found[0].end or kinematics.urdf is None:
         return found
@@ -543,7 +543,7 @@ def _bodies(draft: Draft, loaded: Callable[[], ArmModel], read: Source) -> None:
         if owner not in capsules:
             capsules[owner] = _guessed_capsules(model, chain.names.index(owner)) if owner != BASE else []
     if read.kind == "dh" or not (capsules or draft.part.get("urdf")):
-        capsules = {name: list(lines_of(model, link)) for link, name in enumerate(chain.names)}
+        capsules = {name: list(link_rods(model, link)) for link, name in enumerate(chain.names)}
         draft.remarks.append("geometry: rods along the links, because the file has none")
     draft.geometry = {
         owner: [one.model_dump(by_alias=True, mode="json") for one in found]
@@ -557,7 +557,7 @@ def _bodies(draft: Draft, loaded: Callable[[], ArmModel], read: Source) -> None:
         )
     model = loaded()
     inner = (BASE, *chain.names)
-    for (moving, other), share in share_touching(model, 2.0 * CLEARANCE, _POSTURES, _SEED).items():
+    for (moving, other), share in shares_touching(model, 2.0 * CLEARANCE, _POSTURES, _SEED).items():
         path = [0, *(joint + 1 for joint in chain.ancestors(chain.names.index(moving)))]
         between = len(path) - 1 - path.index(inner.index(other)) if inner.index(other) in path else None
         if share >= (_ALWAYS if between is None else _TOUCHES.get(between, _ALWAYS)):

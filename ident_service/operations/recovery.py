@@ -31,7 +31,7 @@ from ident_service.motion.last_position import PositionFile
 from ident_service.motion.read_only_monitor import Watched, watch
 from ident_service.operations.moving_arms import is_held
 from ident_service.recordings.files import require_writable
-from ident_service.registry.state_folder import control_path, fault_file, ticket_path
+from ident_service.registry.state_folder import arm_fault_store, control_path, ticket_path
 
 LOOK = 0.3  # s
 AT_HOME = 0.05  # rad or m
@@ -87,7 +87,7 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None, name_in_comm
         DriverError: nothing is installed that can reach such an arm.
     """
     limits, name_in_commands = motion_limits(config), name_in_commands or config.name
-    faults = fault_file(state, config.name).remembered()
+    faults = arm_fault_store(state, config.name).remembered()
     pid = controlling_pid(control_path(state, config.name))
     if pid is not None:
         first: tuple[str, ...] = (
@@ -316,4 +316,4 @@ def set_home(config: ArmConfig, state: Path, confirm: Callable[[str], str], arm:
         ticket.unlink(missing_ok=True)
         PositionFile(ticket.parent, config).forget()  # of the zero that is about to be replaced
         drives = (make_arm(config) if arm is None else arm).zero()
-    return ZeroingResult(config.name, posture, drives, fault_file(state, config.name).remembered(), existed)
+    return ZeroingResult(config.name, posture, drives, arm_fault_store(state, config.name).remembered(), existed)

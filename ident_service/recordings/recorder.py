@@ -26,7 +26,7 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from ident_service.errors import RecordingError, RecordingNotWritten
-from ident_service.model.limited_process import own_module
+from ident_service.model.limited_process import module_command
 from ident_service.recordings.cycle import Cycle
 from ident_service.recordings.mcap_writer import RecordingWriter
 from ident_service.recordings.recorder_main import IGNORED, RecorderReport
@@ -199,7 +199,7 @@ class RecorderProcess:
             raise RecordingNotWritten(self.path, self._error)
 
     def _start(self) -> None:
-        command, environment = own_module("ident_service.recordings.recorder_main")
+        command, environment = module_command("ident_service.recordings.recorder_main")
         made: list[int] = []
         # The mask is inherited, so that a Ctrl-C before the process ignores it does not end it.
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, IGNORED)

@@ -58,7 +58,7 @@ def resources(config: ArmConfig) -> tuple[str, ...]:
     return (f"arm {config.name}", *sorted(wires))
 
 
-def know_shipped(db: Database) -> None:
+def register_shipped_arms(db: Database) -> None:
     """Enter the shipped arms in the registry; an uploaded one of the same name stays.
 
     Their descriptions are read when they are asked for: reading all of them takes longer than a start may.
@@ -116,11 +116,11 @@ def add_arm(
     state: Path,
     text: str,
     files: Mapping[str, str],
-    by: str,
+    requester: str,
     *,
     replace: bool = False,
-    judge: Callable[[Path], object] = lambda _: None,
-    draw: Callable[[Path, Path], object] | None = None,
+    check_description: Callable[[Path], object] = lambda _: None,
+    make_meshes: Callable[[Path, Path], object] | None = None,
 ) -> KnownArm:
     """Check and store an uploaded description, enter its arm and return it; a replaced one stays on the disk.
 
@@ -129,27 +129,27 @@ def add_arm(
         state: the state folder.
         text: the YAML.
         files: name to content of the files that it names.
-        by: name of the requester.
+        requester: name of the requester.
         replace: whether it may take the place of another description of its name, a shipped one included.
-        judge: function that raises where something is wrong with the arm of a description that was not known; it takes
-            seconds.
-        draw: function that makes, from a description, the folder with what viewers draw of it (`drawn_meshes`); None
-            without meshes.
+        check_description: function that raises where something is wrong with the arm of a description that was not
+            known; it takes seconds.
+        make_meshes: function that makes, from a description, the folder with what viewers draw of it (`drawn_meshes`);
+            None without meshes.
 
     Raises:
         AlreadyThere: its name is taken by another description.
         UsageError: too large, or files whose names are none.
         ConfigError: every mistake in it, each with line and column.
     """
-    with uploaded(state, text, files) as path:
+    with temporary_upload(state, text, files) as path:
         config = load_arm(path, upload=True)
         _require_free(db, config, replace=replace)
         folder = _description_folder(state, config.name, config.sha256)
         if not folder.exists():
-            judge(path)
+            check_description(path)
         drawn = path.parent / _DRAWN
-        if draw is not None:
-            draw(path, drawn)
+        if make_meshes is not None:
+            make_meshes(path, drawn)
         with db.transaction():  # so that deleting or adding the same arm happens before or after
             _require_free(db, config, replace=replace)
             if not folder.exists():
@@ -157,7 +157,7 @@ def add_arm(
                     for part in path.parent.iterdir():
                         if part.is_file():
                             shutil.copyfile(part, built / part.name)
-            if draw is not None:
+            if make_meshes is not None:
                 shutil.rmtree(folder / _DRAWN, ignore_errors=True)
                 drawn.rename(folder / _DRAWN)
             db.write(
@@ -166,9 +166,9 @@ def add_arm(
                 "folder = excluded.folder, resources = excluded.resources, added = excluded.added, "
                 "added_by = excluded.added_by",
                 *(config.name, config.sha256, config.description, str(folder.relative_to(state))),
-                *(json.dumps(resources(config)), time.time(), by),
+                *(json.dumps(resources(config)), time.time(), requester),
             )
-            note(db, by, "arm added", config.name, sha256=config.sha256)
+            note(db, requester, "arm added", config.name, sha256=config.sha256)
     return KnownArm(config.name, folder / ARM_FILE, config, "uploaded")
 
 
@@ -177,7 +177,7 @@ def _description_folder(state: Path, name: str, sha256: str) -> Path:
 
 
 def drawn_meshes(state: Path, config: ArmConfig) -> dict[str, Any]:
-    """Return the arm's `joints` that `mesh_file` has triangles of, and `notes`; both empty without meshes."""
+    """Return the arm's `joints` that `mesh_bytes` has triangles of, and `notes`; both empty without meshes."""
     try:
         text = (_description_folder(state, config.name, config.sha256) / _DRAWN / DRAWN_LIST).read_text("utf-8")
     except FileNotFoundError:
@@ -186,7 +186,7 @@ def drawn_meshes(state: Path, config: ArmConfig) -> dict[str, Any]:
     return document
 
 
-def mesh_file(state: Path, arm: str, sha256: str, joint: int) -> bytes:
+def mesh_bytes(state: Path, arm: str, sha256: str, joint: int) -> bytes:
     """Return the meshes of a joint's link as triangles in its frame [m]: nine little-endian 32-bit floats each.
 
     Args:
@@ -214,7 +214,7 @@ def _require_free(db: Database, config: ArmConfig, *, replace: bool) -> None:
         )
 
 
-def uploaded_description(state: Path, name: str) -> Path | None:
+def uploaded_description_file(state: Path, name: str) -> Path | None:
     """Return the file of the description of an arm that was uploaded to a state folder; None where there is none."""
     if not _NAME.fullmatch(name) or not (state / FILE).is_file():
         return None
@@ -224,7 +224,7 @@ def uploaded_description(state: Path, name: str) -> Path | None:
 
 
 @contextmanager
-def uploaded(state: Path, text: str, files: Mapping[str, str]) -> Iterator[Path]:
+def temporary_upload(state: Path, text: str, files: Mapping[str, str]) -> Iterator[Path]:
     """Write an uploaded description and its files into a temporary folder and yield its path during the block.
 
     Args:

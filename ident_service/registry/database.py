@@ -418,45 +418,48 @@ class Database:
         """Return the first row of a query, or None."""
         return next(iter(self.rows(sql, *values)), None)
 
-    def known(self, table: str, what: str, name: str, column: str = "id") -> Row:
-        """Return the row of this id, or of another unique column; raise UnknownId where there is none.
+    def known(self, table: str, noun: str, value: str, column: str = "id") -> Row:
+        """Return the row of this id, or with `value` in another unique `column`; raise UnknownId where there is none.
 
         Raises:
             UnknownId: there is none.
         """
-        row = self.row(f"SELECT * FROM {table} WHERE {column} = ?", name)  # noqa: S608 - ours
+        row = self.row(f"SELECT * FROM {table} WHERE {column} = ?", value)  # noqa: S608 - ours
         if row is None:
-            raise UnknownId(f"no {what} {name!r} is known; see the list of {what}s")
+            raise UnknownId(f"no {noun} {value!r} is known; see the list of {noun}s")
         return row
 
-    def newest(self, table: str, what: str, at: str, arm: str | None, before: str | None, most: int) -> list[Row]:
-        """Return at most `most` rows, or those of an arm, the newest first, from the one after the row of id `before`.
+    def newest(
+        self, table: str, noun: str, time_column: str, arm: str | None, before_id: str | None, max_rows: int
+    ) -> list[Row]:
+        """Return at most `max_rows` rows, or those of an arm, the newest first, from the one older than `before_id`.
 
         Args:
             table: table of the rows.
-            what: name of the rows, for the error.
-            at: column with the rows' time.
+            noun: name of the rows, for the error.
+            time_column: column with the rows' time.
             arm: name; all arms when None.
-            before: id of the row before the first; the first of all when None.
-            most: largest number of rows.
+            before_id: id of the row before the first; the first of all when None.
+            max_rows: largest number of rows.
 
         Raises:
             UnknownId: there is no row of that id.
         """
-        last = None if before is None else self.known(table, what, before)[at]
+        last = None if before_id is None else self.known(table, noun, before_id)[time_column]
         return self.rows(
             f"SELECT * FROM {table} WHERE (? IS NULL OR arm = ?) "  # noqa: S608 - ours
-            f"AND (? IS NULL OR {at} < ? OR {at} = ? AND id > ?) ORDER BY {at} DESC, id LIMIT ?",
-            *(arm, arm, last, last, last, before, most),
+            f"AND (? IS NULL OR {time_column} < ? OR {time_column} = ? AND id > ?) "
+            f"ORDER BY {time_column} DESC, id LIMIT ?",
+            *(arm, arm, last, last, last, before_id, max_rows),
         )
 
-    def sound(self) -> bool:
+    def is_intact(self) -> bool:
         """Return whether SQLite finds nothing wrong in the whole file."""
         return self.rows("PRAGMA integrity_check") == [{"integrity_check": "ok"}] and not self.rows(
             "PRAGMA foreign_key_check"
         )
 
-    def rest(self) -> None:
+    def checkpoint_when_idle(self) -> None:
         """Move the log into the main file once nothing has been written for two seconds; waits for nobody.
 
         Until then the last transactions are in SQLite's log beside it, which whoever copies one file leaves behind.
@@ -516,27 +519,27 @@ LOG = logging.getLogger("ident.audit")
 _Line = tuple[float, str, str, str, str]
 
 
-def note(db: Database, who: str, what: str, about: str, **detail: Any) -> None:
-    """Add one line to the audit trail.
+def note(db: Database, actor: str, action: str, subject: str, **detail: Any) -> None:
+    """Add a line to the audit trail: at the present time, `actor` did `action` to `subject`.
 
     Args:
         db: the registry.
-        who: the name of a token, `terminal:NAME`, or `service`.
-        what: one word or two: `job created`, `accepted`.
-        about: id of the arm, job or run.
+        actor: the name of a token, `terminal:NAME`, or `service`.
+        action: one word or two: `job created`, `accepted`.
+        subject: id of the arm, job or run.
         detail: JSON values.
     """
-    _enter(db, _line(who, what, about, detail))
+    _enter(db, _line(actor, action, subject, detail))
 
 
-def note_later(state: Path, who: str, what: str, about: str, **detail: Any) -> None:
-    """Store an audit line, with the present time, in a file, from where it is entered later; as `note`.
+def note_later(state: Path, actor: str, action: str, subject: str, **detail: Any) -> None:
+    """Store a line of the audit trail, as for `note`, in a file, from which `write_deferred_entries` enters it.
 
     Args:
         state: the state folder.
-        who: as for `note`.
-        what: as for `note`.
-        about: as for `note`.
+        actor: as for `note`.
+        action: as for `note`.
+        subject: as for `note`.
         detail: as for `note`.
 
     Raises:
@@ -544,7 +547,7 @@ def note_later(state: Path, who: str, what: str, about: str, **detail: Any) -> N
     """
     path = state / _WAITING / f"{time.time_ns()}-{secrets.token_hex(4)}.json"
     path.parent.mkdir(mode=0o700, exist_ok=True)
-    write_atomically(path, json.dumps(_line(who, what, about, detail)))
+    write_atomically(path, json.dumps(_line(actor, action, subject, detail)))
     give_to_owner(state, path)
 
 
@@ -575,9 +578,9 @@ class AuditQueue:
         self._thread = threading.Thread(target=self._work, name="audit", daemon=True)
         self._thread.start()
 
-    def note(self, who: str, what: str, about: str, **detail: Any) -> None:
-        """Queue one line with the present time; never waits. It is lost, with an error logged, if too many wait."""
-        line = _line(who, what, about, detail)
+    def note(self, actor: str, action: str, subject: str, **detail: Any) -> None:
+        """Queue a line for the audit trail, without waiting; it is lost, with an error logged, if too many wait."""
+        line = _line(actor, action, subject, detail)
         with self._changed:
             if len(self._lines) < _MOST_WAITING:
                 self._lines.append(line)
@@ -585,18 +588,18 @@ class AuditQueue:
                 return
         LOG.error("a line of the audit trail is lost, because too many wait: %s", line)
 
-    def flush(self, seconds: float) -> bool:
-        """Wait until every line is entered, at most `seconds`; return whether all are."""
+    def flush(self, timeout: float) -> bool:
+        """Wait until every line is entered, at most `timeout` [s]; return whether all are."""
         with self._changed:
-            return self._changed.wait_for(lambda: not self._lines, seconds)
+            return self._changed.wait_for(lambda: not self._lines, timeout)
 
-    def close(self, seconds: float = 5.0) -> None:
-        """Enter the queued lines, as far as the registry takes them in `seconds`, and end the thread."""
-        self.flush(seconds)
+    def close(self, timeout: float = 5.0) -> None:
+        """Enter the queued lines, as far as the registry takes them in `timeout` [s], and end the thread."""
+        self.flush(timeout)
         self._ending.set()
         with self._changed:
             self._changed.notify_all()
-        self._thread.join(seconds)
+        self._thread.join(timeout)
         for line in self._lines:
             LOG.error("a line of the audit trail is lost, because the registry cannot be written: %s", line)
 
@@ -626,21 +629,23 @@ def _enter(db: Database, line: _Line) -> None:
     db.write("INSERT INTO audit (at, who, what, about, detail) VALUES (?, ?, ?, ?, ?)", *line)
 
 
-def audit_log(db: Database, *, before: int | None = None, most: int = 100) -> list[Row]:
-    """Return lines of the audit trail, the newest first, from the one before the id `before`."""
+def audit_log(db: Database, *, before_id: int | None = None, max_lines: int = 100) -> list[Row]:
+    """Return lines of the audit trail, the newest first, from the one before the id `before_id`."""
     rows = db.rows(
-        "SELECT * FROM audit WHERE id < ? ORDER BY id DESC LIMIT ?", 2**62 if before is None else before, most
+        "SELECT * FROM audit WHERE id < ? ORDER BY id DESC LIMIT ?",
+        2**62 if before_id is None else before_id,
+        max_lines,
     )
     return [{**row, "detail": json.loads(row["detail"])} for row in rows]
 
 
-def audit_entries_after(db: Database, line: int, most: int = 500) -> list[Row]:
+def audit_entries_after(db: Database, after_id: int, max_lines: int = 500) -> list[Row]:
     """Return lines of the audit trail after the one of this id, the earliest first."""
-    rows = db.rows("SELECT * FROM audit WHERE id > ? ORDER BY id LIMIT ?", line, most)
+    rows = db.rows("SELECT * FROM audit WHERE id > ? ORDER BY id LIMIT ?", after_id, max_lines)
     return [{**row, "detail": json.loads(row["detail"])} for row in rows]
 
 
-def last_line(db: Database) -> int:
+def newest_line_id(db: Database) -> int:
     """Return the id of the newest line of the audit trail; 0 where there is none."""
     row = db.row("SELECT MAX(id) AS id FROM audit")
     return int(row["id"] or 0) if row is not None else 0

@@ -29,32 +29,32 @@ SAMPLES: Final = "\x1e"  # before a line of a job's log that is a sample, as JSO
 
 def add_job(
     db: Database,
-    job: str,
+    job_id: str,
     kind: str,
     arm: str | None,
     request: dict[str, Any],
-    words: list[str],
-    by: str,
+    arguments: list[str],
+    requester: str,
     *,
     motion: bool,
-    run: str | None,
+    run_id: str | None,
 ) -> Row:
-    """Enter a queued job; return its row."""
+    """Enter a queued job; return its row. `arguments` are the words of its command after `ident`."""
     db.write(
         "INSERT INTO jobs (id, kind, arm, state, motion, request, words, run, created, created_by) "
         "VALUES (?, ?, ?, 'queued', ?, ?, ?, ?, ?, ?)",
-        *(job, kind, arm, int(motion), json.dumps(request), json.dumps(words), run, time.time(), by),
+        *(job_id, kind, arm, int(motion), json.dumps(request), json.dumps(arguments), run_id, time.time(), requester),
     )
-    return known_job(db, job)
+    return known_job(db, job_id)
 
 
-def known_job(db: Database, job: str) -> Row:
+def known_job(db: Database, job_id: str) -> Row:
     """Return the row of the job of this id; raise UnknownId where there is none.
 
     Raises:
         UnknownId: there is none.
     """
-    return _read(db.known("jobs", "job", job))
+    return _read(db.known("jobs", "job", job_id))
 
 
 def jobs(
@@ -65,7 +65,7 @@ def jobs(
     before: int | None = None,
     most: int = 100,
 ) -> list[Row]:
-    """Return jobs in some states, of an arm if one is named, the newest first."""
+    """Return at most `most` jobs in `states`, of an arm if named, the newest first, below the number `before`."""
     marks = ", ".join("?" * len(states))
     rows = db.rows(
         f"SELECT * FROM jobs WHERE state IN ({marks}) AND (? IS NULL OR arm = ?) AND number < ? "  # noqa: S608 - marks
@@ -75,60 +75,62 @@ def jobs(
     return [_read(row) for row in rows]
 
 
-def queue(db: Database) -> list[Row]:
+def queued_jobs(db: Database) -> list[Row]:
     """Return the queued jobs, the earliest first."""
     return [_read(row) for row in db.rows("SELECT * FROM jobs WHERE state = 'queued' ORDER BY number")]
 
 
-def started(db: Database, job: str, process: str) -> bool:
-    """Mark a queued job as running; False where it is not queued any more."""
+def mark_started(db: Database, job_id: str, process: str) -> bool:
+    """Mark a queued job as running, by `process`; return False, and change nothing, where it is not queued any more."""
     return bool(
         db.write(
             "UPDATE jobs SET state = 'running', started = ?, process = ? WHERE id = ? AND state = 'queued'",
-            *(time.time(), process, job),
+            *(time.time(), process, job_id),
         )
     )
 
 
-def ended(db: Database, job: str, state: str, detail: str, exit_code: int | None = None) -> bool:
-    """Mark a job as ended; False where it is marked already."""
+def mark_ended(db: Database, job_id: str, state: str, detail: str, exit_code: int | None = None) -> bool:
+    """Set a job's last state, detail and exit code; return False, and change nothing, where it has ended already."""
     return bool(
         db.write(
             "UPDATE jobs SET state = ?, detail = ?, exit_code = ?, ended = ? "
             "WHERE id = ? AND state IN ('queued', 'running')",
-            *(state, detail, exit_code, time.time(), job),
+            *(state, detail, exit_code, time.time(), job_id),
         )
     )
 
 
-def made_nothing(db: Database, job: str) -> None:
+def clear_folder_id(db: Database, job_id: str) -> None:
     """Clear the id of the folder that a job was to make, and has not made: it leads nowhere."""
-    db.write("UPDATE jobs SET run = NULL WHERE id = ?", job)
+    db.write("UPDATE jobs SET run = NULL WHERE id = ?", job_id)
 
 
-def explain(db: Database, job: str, detail: str) -> None:
+def set_detail(db: Database, job_id: str, detail: str) -> None:
     """Replace the `detail` of a job, such as of one that has ended; its state is not looked at."""
-    db.write("UPDATE jobs SET detail = ? WHERE id = ?", detail, job)
+    db.write("UPDATE jobs SET detail = ? WHERE id = ?", detail, job_id)
 
 
-def enter_key(db: Database, who: str, key: str, request: str, job: str) -> None:
+def store_idempotency_key(db: Database, token_name: str, key: str, request_sha256: str, job_id: str) -> None:
     """Store for a day that a request with an idempotency key made a job.
 
     Args:
         db: the registry.
-        who: name of the token.
+        token_name: name of the token.
         key: idempotency key of the request; each token has its own keys.
-        request: SHA-256 of the request's content.
-        job: id.
+        request_sha256: SHA-256 of the request's content.
+        job_id: id.
 
     Raises:
         sqlite3.IntegrityError: the key has made a job already.
     """
     db.write("DELETE FROM idempotency_keys WHERE at < ?", time.time() - KEY_SECONDS)
-    db.write("INSERT INTO idempotency_keys VALUES (?, ?, ?, ?, ?)", who, key, request, job, time.time())
+    db.write(
+        "INSERT INTO idempotency_keys VALUES (?, ?, ?, ?, ?)", token_name, key, request_sha256, job_id, time.time()
+    )
 
 
-def job_of_key(db: Database, who: str, key: str, request: str) -> Row | None:
+def job_of_idempotency_key(db: Database, token_name: str, key: str, request_sha256: str) -> Row | None:
     """Return the job that this key made within a day, or None; raise AlreadyThere if that was for another request.
 
     Raises:
@@ -136,11 +138,11 @@ def job_of_key(db: Database, who: str, key: str, request: str) -> Row | None:
     """
     row = db.row(
         "SELECT request, job FROM idempotency_keys WHERE who = ? AND key = ? AND at >= ?",
-        *(who, key, time.time() - KEY_SECONDS),
+        *(token_name, key, time.time() - KEY_SECONDS),
     )
     if row is None:
         return None
-    if row["request"] != request:
+    if row["request"] != request_sha256:
         raise AlreadyThere(f"the idempotency key {key!r} was used for another request; give each its own")
     return known_job(db, row["job"])
 

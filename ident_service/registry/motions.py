@@ -23,43 +23,45 @@ def new_id(arm: str) -> str:
     return f"{datetime.now(UTC).strftime('%Y%m%dT%H%M%SZ')}-{arm}-{secrets.token_hex(3)}"
 
 
-def index_motion(db: Database, state: Path, motion: str, arm: str, by: str) -> None:
+def index_motion(db: Database, state: Path, motion_id: str, arm: str, requester: str) -> None:
     """Enter a motion, whose file is in its folder, in the registry, if it is not there yet.
 
     Raises:
         UsageError: it is not one.
     """
-    path = state / MOTIONS / motion / MOTION_FILE
+    path = state / MOTIONS / motion_id / MOTION_FILE
     seen = read_excitation(path)
     db.write(
         "INSERT OR IGNORE INTO motions VALUES (?, ?, ?, ?, ?, ?, ?)",
-        *(motion, arm, seen.name, seen.duration, file_sha256(path), time.time(), by),
+        *(motion_id, arm, seen.name, seen.duration, file_sha256(path), time.time(), requester),
     )
 
 
-def add_motion(db: Database, state: Path, arm: str, text: str, by: str, joints: int) -> Row:
+def add_motion(db: Database, state: Path, arm: str, json_text: str, requester: str, joint_count: int) -> Row:
     """Store an uploaded motion, and return its row.
 
     Args:
         db: the registry.
         state: the state folder.
         arm: name of the arm that it is for.
-        text: content of the motion's file.
-        by: name of the requester.
-        joints: number of joints of the arm.
+        json_text: content of the motion's file.
+        requester: name of the requester.
+        joint_count: number of joints of the arm.
 
     Raises:
         UsageError: not a motion, or one of an arm with another number of joints; the message says what is wrong.
     """
-    found = excitation_from_json(text).path.joints
-    if found != joints:
-        raise UsageError(f"a motion of {found} joints, but {arm} has {joints}; upload one that was designed for it")
+    found = excitation_from_json(json_text).path.joints
+    if found != joint_count:
+        raise UsageError(
+            f"a motion of {found} joints, but {arm} has {joint_count}; upload one that was designed for it"
+        )
     motion = new_id(arm)
     with atomic_folder(state / MOTIONS / motion) as folder:
-        write_atomically(folder / MOTION_FILE, text)
+        write_atomically(folder / MOTION_FILE, json_text)
     with db.transaction():
-        index_motion(db, state, motion, arm, by)
-        note(db, by, "motion added", motion, arm=arm, sha256=hashlib.sha256(text.encode()).hexdigest())
+        index_motion(db, state, motion, arm, requester)
+        note(db, requester, "motion added", motion, arm=arm, sha256=hashlib.sha256(json_text.encode()).hexdigest())
     return known_motion(db, motion)
 
 
@@ -73,7 +75,7 @@ def known_motion(db: Database, motion: str) -> Row:
 
 
 def motions(db: Database, arm: str | None = None, *, before: str | None = None, most: int = 500) -> list[Row]:
-    """Return motions, or those of an arm, the newest first, from the one after the id `before`."""
+    """Return at most `most` motions, of an arm if named, the newest first, from the one older than `before`."""
     return db.newest("motions", "motion", "added", arm, before, most)
 
 

@@ -108,7 +108,7 @@ def known_run(db: Database, run: str) -> Row:
 
 
 def runs(db: Database, arm: str | None = None, *, before: str | None = None, most: int = 100) -> list[Row]:
-    """Return runs, or those of an arm, the newest first, from the one after the id `before`."""
+    """Return at most `most` runs, of an arm if named, the newest first, starting with the one older than `before`."""
     return db.newest("runs", "run", "created", arm, before, most)
 
 
@@ -117,18 +117,18 @@ def recordings(db: Database, run: str) -> list[Row]:
     return db.rows("SELECT name, sha256, bytes, deleted FROM recordings WHERE run = ? ORDER BY name", run)
 
 
-def recordings_of(db: Database, patterns: Sequence[str]) -> list[Row]:
+def recordings_of(db: Database, arm_patterns: Sequence[str]) -> list[Row]:
     """Return run, arm and name of every recording that is kept of motions and uploads of some arms, by run.
 
     Args:
         db: the registry.
-        patterns: names of arms, with the wildcards of file names.
+        arm_patterns: names of arms, with the wildcards of file names.
     """
     found = db.rows(
         "SELECT runs.id AS run, arm, name FROM recordings JOIN runs ON runs.id = recordings.run "
         "WHERE deleted IS NULL AND kind IN ('motion', 'recording') ORDER BY runs.id, name"
     )
-    return [row for row in found if any(fnmatchcase(str(row["arm"]), pattern) for pattern in patterns)]
+    return [row for row in found if any(fnmatchcase(str(row["arm"]), pattern) for pattern in arm_patterns)]
 
 
 def recording_name(db: Database, run: str) -> str:
@@ -150,15 +150,15 @@ MOST_TAGS: Final = 16
 _TAG = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:+-]{0,39}")
 
 
-def label_run(db: Database, run: str, tags: Sequence[str], words: str, who: str) -> Row:
+def label_run(db: Database, run: str, tags: Sequence[str], run_note: str, requester: str) -> Row:
     """Replace the tags and the note of a run, and return its new labels.
 
     Args:
         db: the registry.
         run: id.
         tags: words by which runs are found again; an empty list takes the tags away.
-        words: the note; may be empty.
-        who: name of the requester.
+        run_note: the note; may be empty.
+        requester: name of the requester.
 
     Returns:
         The labels (`run_labels`).
@@ -173,15 +173,15 @@ def label_run(db: Database, run: str, tags: Sequence[str], words: str, who: str)
         raise UsageError(f"{len(chosen)} tags are too many; a run has {MOST_TAGS} at most")
     if bad := [tag for tag in chosen if not _TAG.fullmatch(tag)]:
         raise UsageError(f"{bad[0]!r}: a tag is one word of letters, digits and _ . : + -, 40 characters at most")
-    if len(words) > LONGEST_NOTE:
-        raise UsageError(f"the note has {len(words)} characters; {LONGEST_NOTE} at most")
+    if len(run_note) > LONGEST_NOTE:
+        raise UsageError(f"the note has {len(run_note)} characters; {LONGEST_NOTE} at most")
     with db.transaction():
         db.write(
             "INSERT INTO run_labels VALUES (?, ?, ?, ?, ?) ON CONFLICT (run) DO UPDATE SET "
             "tags = excluded.tags, note = excluded.note, at = excluded.at, who = excluded.who",
-            *(known, json.dumps(chosen), words, time.time(), who),
+            *(known, json.dumps(chosen), run_note, time.time(), requester),
         )
-        note(db, who, "run labelled", known, tags=chosen, note=words)
+        note(db, requester, "run labelled", known, tags=chosen, note=run_note)
     return run_labels(db, known)[known]
 
 
@@ -191,9 +191,9 @@ def run_labels(db: Database, run: str | None = None) -> dict[str, Row]:
     return {row["run"]: {**row, "tags": json.loads(row["tags"])} for row in found}
 
 
-def shown_labels(found: Mapping[str, Row], run: str) -> dict[str, Any]:
+def shown_labels(labels: Mapping[str, Row], run: str) -> dict[str, Any]:
     """Return `tags` and `note` of a run from what `run_labels` found; empty ones where nobody gave it any."""
-    row = found.get(run, {"tags": [], "note": ""})
+    row = labels.get(run, {"tags": [], "note": ""})
     return {"tags": row["tags"], "note": row["note"]}
 
 

@@ -159,18 +159,18 @@ def ticket_path(state: Path, arm: str) -> Path:
     return arm_folder(state, arm) / "ticket.json"
 
 
-def fault_file(state: Path, arm: str) -> FaultStore:
+def arm_fault_store(state: Path, arm: str) -> FaultStore:
     """Return the store of the arm's faults that no person has acknowledged (`motion/fault_store.py`)."""
     from ident_service.motion.fault_store import FaultStore
 
     return FaultStore(arm_folder(state, arm))
 
 
-def new_run_folder(state: Path, arm: str, kind: str = "runs") -> Path:
-    """Return a path under the state folder for a new run, or thing of `kind`; nothing is there, nothing is made."""
+def new_run_folder(state: Path, arm: str, parent_name: str = "runs") -> Path:
+    """Return a free path for a new run in the state folder's subfolder `parent_name`; make nothing."""
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-    folder, count = state / kind / f"{stamp}-{arm}", 1
+    folder, count = state / parent_name / f"{stamp}-{arm}", 1
     while folder.exists():
         count += 1
-        folder = state / kind / f"{stamp}-{arm}-{count}"
+        folder = state / parent_name / f"{stamp}-{arm}-{count}"
     return folder

@@ -39,7 +39,7 @@ class Access:
     role: Role
 
 
-def add_token(db: Database, name: str, role: Role, by: str) -> str:
+def add_token(db: Database, name: str, role: Role, requester: str) -> str:
     """Make a token and return it; it cannot be read again later.
 
     Raises:
@@ -52,11 +52,11 @@ def add_token(db: Database, name: str, role: Role, by: str) -> str:
         if db.row("SELECT 1 FROM tokens WHERE name = ?", name):
             raise UsageError(f"there is, or was, a token {name!r}; the audit trail names it, so give another name")
         db.write("INSERT INTO tokens VALUES (?, ?, ?, ?, NULL)", name, role, digest(secret), time.time())
-        note(db, by, "token added", name, role=role)
+        note(db, requester, "token added", name, role=role)
     return secret
 
 
-def revoke_token(db: Database, name: str, by: str) -> None:
+def revoke_token(db: Database, name: str, requester: str) -> None:
     """Revoke the token of this name; raise UnknownId if there is none that counts.
 
     Raises:
@@ -65,7 +65,7 @@ def revoke_token(db: Database, name: str, by: str) -> None:
     with db.transaction():
         if not db.write("UPDATE tokens SET revoked = ? WHERE name = ? AND revoked IS NULL", time.time(), name):
             raise UnknownId(f"no token {name!r} that could be revoked; `ident tokens` names them")
-        note(db, by, "token revoked", name)
+        note(db, requester, "token revoked", name)
 
 
 def tokens(db: Database) -> list[Row]:
@@ -79,32 +79,33 @@ def digests(db: Database) -> dict[str, Access]:
     return {row["sha256"]: Access(row["name"], row["role"]) for row in rows}
 
 
-def access(db: Database, secret: str) -> Access | None:
+def access(db: Database, token: str) -> Access | None:
     """Return name and role of a token; None if it is unknown or revoked."""
-    return digests(db).get(digest(secret))
+    return digests(db).get(digest(token))
 
 
-def begin_session(db: Database, session: str, secret: str, until: float, most: int) -> None:
-    """Store a session of the page, beyond restarts of the service; over `most`, those that end first are deleted.
+def begin_session(db: Database, session_word: str, token: str, ends_at: float, max_sessions: int) -> None:
+    """Store a session of the page; sessions that have ended, and the first to end over `max_sessions`, are deleted.
 
     Args:
         db: the registry.
-        session: random word of the session's cookie, of which only the digest is stored.
-        secret: the token that it was exchanged for; it ends with that, too.
-        until: end of the session [s since 1970 in UTC].
-        most: largest number of sessions.
+        session_word: random word of the session's cookie, of which only the digest is stored.
+        token: the token that it was exchanged for; it ends with that, too.
+        ends_at: end of the session [s since 1970 in UTC].
+        max_sessions: largest number of sessions.
     """
     with db.transaction():
         db.write("DELETE FROM sessions WHERE until < ?", time.time())
-        db.write("INSERT INTO sessions VALUES (?, ?, ?)", digest(session), digest(secret), until)
+        db.write("INSERT INTO sessions VALUES (?, ?, ?)", digest(session_word), digest(token), ends_at)
         db.write(
-            "DELETE FROM sessions WHERE sha256 NOT IN (SELECT sha256 FROM sessions ORDER BY until DESC LIMIT ?)", most
+            "DELETE FROM sessions WHERE sha256 NOT IN (SELECT sha256 FROM sessions ORDER BY until DESC LIMIT ?)",
+            max_sessions,
         )
 
 
-def end_session(db: Database, session: str) -> None:
+def end_session(db: Database, session_word: str) -> None:
     """Delete a session."""
-    db.write("DELETE FROM sessions WHERE sha256 = ?", digest(session))
+    db.write("DELETE FROM sessions WHERE sha256 = ?", digest(session_word))
 
 
 def sessions(db: Database) -> dict[str, tuple[str, float]]:
@@ -150,13 +151,13 @@ def first_token(db: Database, state: Path) -> Path:
     return path
 
 
-def revoke_first_tokens(db: Database, by: str) -> None:
+def revoke_first_tokens(db: Database, requester: str) -> None:
     """Revoke all tokens that `first_token` made, for a registry that comes into another place or time."""
     for row in db.rows(
         "SELECT name FROM tokens WHERE revoked IS NULL AND name IN "
         "(SELECT about FROM audit WHERE who = 'service' AND what = 'token added')"
     ):
-        revoke_token(db, row["name"], by)
+        revoke_token(db, row["name"], requester)
 
 
 def read_token(path: Path) -> str | None:

@@ -19,7 +19,7 @@ from ident_service.estimation.identify import Candidate, Estimate
 from ident_service.estimation.least_squares import TorqueError
 from ident_service.estimation.uncertainty import IDENTIFIED_BELOW, NEGLIGIBLE_TORQUE, WEAK_BELOW
 from ident_service.model.chain import Array
-from ident_service.model.likely_bodies import IN_WORDS, likely_bodies, lines_of
+from ident_service.model.likely_bodies import IN_WORDS, likely_bodies, link_rods
 from ident_service.model.parameter_layout import NO_STRIBECK
 from ident_service.results.assessment import Assessment, assess_estimate
 from ident_service.results.evidence.gathering import ellipsoid
@@ -131,7 +131,7 @@ def implausible_links(estimate: Estimate) -> tuple[str, ...]:
         wrong = []
         if not usual / MASSES <= mass <= usual * MASSES:
             wrong.append(f"{mass:.2g} kg, where {usual / MASSES:.2g} to {usual * MASSES:.2g} kg are likely")
-        own = max(float(np.linalg.norm(np.subtract(line.end, line.start))) for line in lines_of(model, link))
+        own = max(float(np.linalg.norm(np.subtract(line.end, line.start))) for line in link_rods(model, link))
         away, most = float(np.linalg.norm(center - middle)), max(own, _REACH * reach)
         if away > most:
             wrong.append(f"its centre {away:.2g} m from a likely place, where {most:.2g} m would be much")

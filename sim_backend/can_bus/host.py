@@ -59,7 +59,7 @@ class LocalPort:
                 raise BusError("off", f"ident_wire {self._wire.name}", self._wire.bitrate)
             if not self._wire.medium.offer(self.port, frame, now):
                 raise BusError("full", f"ident_wire {self._wire.name}", self._wire.bitrate)
-        self._wire.turn(now)
+        self._wire.advance_to(now)
 
     def offer(self, frames: Sequence[Frame]) -> int:
         """Queue frames without raising, until one is not taken or the port is off; return how many were taken."""
@@ -68,7 +68,7 @@ class LocalPort:
             if self.port.counters.state == "off" or not self._wire.medium.offer(self.port, self._as_sent(frame), now):
                 break
             taken += 1
-        self._wire.turn(now)
+        self._wire.advance_to(now)
         return taken
 
     def _as_sent(self, frame: Frame) -> Frame:

@@ -142,7 +142,7 @@ class CanBusServer:
                         os.eventfd_read(self._wake)
                 elif (end := self._ends.get(number)) is not None:
                     self._read(end, now)
-            self.turn(time.monotonic_ns())
+            self.advance_to(time.monotonic_ns())
 
     def watched(self) -> tuple[list[int], int | None]:
         """Return the descriptors to wait for, and when the frame under way ends [ns], None while there is none."""
@@ -157,7 +157,7 @@ class CanBusServer:
             ]
             return [self._listener.fileno(), self._wake, *ends], self.medium.end_ns
 
-    def turn(self, now_ns: int) -> None:
+    def advance_to(self, now_ns: int) -> None:
         """Advance the simulated bus to `now_ns` and deliver received frames, without reading any socket."""
         self.medium.advance(now_ns)
         for end in list(self._ends.values()):
@@ -173,7 +173,7 @@ class CanBusServer:
             return
         sock.setblocking(False)
         # A refused end is told in answer to its greeting: closed before, its unread greeting would hide the answer.
-        if link.trusted(sock) and len(self._ends) < 2 * MOST_ENDS and sock.fileno() < _SELECT_LIMIT:
+        if link.peer_is_trusted(sock) and len(self._ends) < 2 * MOST_ENDS and sock.fileno() < _SELECT_LIMIT:
             self._ends[sock.fileno()] = _End(sock)
         else:
             sock.close()

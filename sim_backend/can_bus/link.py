@@ -100,13 +100,13 @@ def connect(channel: str) -> socket.socket:
             f"or a wire alone: `python -m sim_backend.can_bus {channel}`"
         )
         raise BusError("absent", name, remedy=remedy, detail=error.strerror or "") from None
-    if not trusted(sock):
+    if not peer_is_trusted(sock):
         sock.close()
         raise BusError("refused", name, remedy="another user runs this wire; take another channel")
     return sock
 
 
-def trusted(sock: socket.socket) -> bool:
+def peer_is_trusted(sock: socket.socket) -> bool:
     """Return whether the process on the other side runs as this user or as root."""
     _, uid, _ = _CREDENTIALS.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
     return uid in (os.getuid(), 0)

@@ -52,9 +52,9 @@ class ErrorCounters:
         self.sending = self.receiving = 0
         self.state: State = "active"
 
-    def set(self, sending: int, receiving: int, stamp_ns: int) -> Frame | None:
+    def set(self, send_errors: int, receive_errors: int, stamp_ns: int) -> Frame | None:
         """Set both counters; return an error frame if the controller's state changes, else None."""
-        self.sending, self.receiving = min(max(sending, 0), _OFF), min(max(receiving, 0), _OFF)
+        self.sending, self.receiving = min(max(send_errors, 0), _OFF), min(max(receive_errors, 0), _OFF)
         return self._change(stamp_ns)
 
     def send_error(self, stamp_ns: int) -> Frame | None:
@@ -157,7 +157,7 @@ class BusEndpoint:
             bytes(any(k & mask == wanted & mask for wanted, mask in chosen) for k in range(0x800)) if chosen else None
         )
 
-    def hear(self, frame: Frame, own: bool = False) -> None:
+    def hear(self, frame: Frame, sent_by_itself: bool = False) -> None:
         """Put a frame into the inbox, with whether it is its own, if it passes the filters and finds room."""
         if self._passes is not None and not frame.error and (frame.extended or not self._passes[frame.identifier]):
             return
@@ -168,7 +168,7 @@ class BusEndpoint:
         if self._overflowed:
             self._overflowed = False
             self.inbox.append((overflow(frame.stamp_ns), False))
-        self.inbox.append((frame, own))
+        self.inbox.append((frame, sent_by_itself))
 
     def take(self) -> list[tuple[Frame, bool]]:
         """Return the received frames, each with whether it was its own, and empty the inbox."""
@@ -251,13 +251,13 @@ class Medium:
             self._current, self._free_ns = None, end
             self._finish(port, frame, end)
 
-    def destroy(self, count: int, port: BusEndpoint | None = None) -> None:
+    def destroy_next(self, count: int, port: BusEndpoint | None = None) -> None:
         """Have the next `count` frames, of one port or of any, destroyed by an error; their senders repeat them."""
         self._to_destroy[port] = count
 
-    def set_counters(self, port: BusEndpoint, sending: int, receiving: int, now_ns: int) -> None:
+    def set_counters(self, port: BusEndpoint, send_errors: int, receive_errors: int, now_ns: int) -> None:
         """Set a controller's error counters, with the change of state that follows; 256 sending is bus-off."""
-        self._note(port, port.counters.set(sending, receiving, now_ns))
+        self._note(port, port.counters.set(send_errors, receive_errors, now_ns))
 
     def restart(self, port: BusEndpoint, now_ns: int) -> None:
         """Return a controller to the bus with its error counters at 0, and tell it so by an error frame."""

@@ -70,19 +70,19 @@ class VendorWatchdogs:
 
     def stop(self) -> None:
         """Stop both watchdogs."""
-        self._node.stop(_SYNC)
-        self._node.stop(_TARGET)
+        self._node.stop_timer(_SYNC)
+        self._node.stop_timer(_TARGET)
 
-    def due(self, name: str) -> None:
-        """Send the emergency of a missing SYNC or target and stop the drive, if such a timer ran out; ignore others."""
-        if name in (_SYNC, _TARGET):
-            self._emergency.occurs(NO_SYNC if name == _SYNC else NO_TARGET)
+    def timer_ran_out(self, timer: str) -> None:
+        """Send the emergency of a missing SYNC or target and stop the drive, if `timer` is of one; ignore others."""
+        if timer in (_SYNC, _TARGET):
+            self._emergency.add_error(NO_SYNC if timer == _SYNC else NO_TARGET)
             self._late()
 
     def _wait(self, name: str, code: int, delay_ns: int) -> None:
         if delay_ns and self._there:
-            self._node.after(name, delay_ns)
-            self._emergency.is_over(code)
+            self._node.start_timer(name, delay_ns)
+            self._emergency.remove_errors(code)
 
 
 _RPM = 60.0 / (2.0 * math.pi)
@@ -114,8 +114,8 @@ class PositionLoop:
         """End the position loop; when `torque` is called again, it begins from where the motor is then."""
         self._line, self._integral = None, 0.0
 
-    def torque(self, now_ns: int, most: float) -> float:
-        """Return the torque that the loop asks for [N m at the motor]; above `most` the integral part is frozen."""
+    def torque(self, now_ns: int, max_torque: float) -> float:
+        """Return the motor torque that the loop asks for [N m]; above `max_torque` the integral part is frozen."""
         goal, per_radian = self._objects.number(0x607A), self._motor.counts_per_turn / (2.0 * math.pi)
         actual = self._motor.encoder(now_ns)
         if self._line is None:
@@ -127,7 +127,7 @@ class PositionLoop:
         away, seconds = (there - actual) / per_radian, (now_ns - self._last_ns) * 1e-9
         lag = slope / per_radian - self._motor.speed(now_ns)
         asked = self._tuning.stiffness * away + self._tuning.damping * lag + self._integral
-        if abs(asked) < most or asked * away < 0.0:
+        if abs(asked) < max_torque or asked * away < 0.0:
             self._integral += self._tuning.integral * away * seconds
         self._last_ns = now_ns
         return asked
@@ -171,10 +171,10 @@ class TorqueLoop:
         cyclic = number(0x6061) in self._personality.modes
         target = self._personality.target_torque(self._objects) + number(0x60B2) if cyclic else 0
         if follows := number(0x6061) == _CSP and 0x607A00 in self._objects.entries:
-            count = self._personality.torque(1.0, self._objects)
-            most, self._motor.holds = self._personality.reach(self._objects) * count, True
+            count = self._personality.torque_of_counts(1.0, self._objects)
+            most, self._motor.holds = self._personality.torque_limit(self._objects) * count, True
             target = round(self._position.torque(now_ns, most) / count) if count else 0
-        reach = int(self._personality.reach(self._objects) * self._motor.defects.torque_share)
+        reach = int(self._personality.torque_limit(self._objects) * self._motor.defects.torque_share)
         demand = min(max(target, -reach), reach)
         self.follows = cyclic or follows
         self.limited = demand != target
@@ -186,7 +186,7 @@ class TorqueLoop:
             self._add(fraction * demand, now_ns)
         else:
             values[0x607700] = values[0x607800] = round(fraction * demand)
-        self._motor.drive(self._personality.torque(fraction * demand, self._objects), now_ns)
+        self._motor.drive(self._personality.torque_of_counts(fraction * demand, self._objects), now_ns)
 
     def _add(self, acts: float, now_ns: int) -> None:
         """Note the torque [counts] that acts from now on, for the mean that is reported."""
@@ -194,7 +194,7 @@ class TorqueLoop:
         self._sum += acted * (now_ns - since_ns)
         self._acting = acts, now_ns
 
-    def tell_mean(self, now_ns: int) -> None:
+    def report_mean_torque(self, now_ns: int) -> None:
         """Set 6077h and 6078h to the mean torque since the last call, while a position loop holds the motor."""
         if not self._motor.holds:
             return
@@ -205,7 +205,7 @@ class TorqueLoop:
         self._sum, self._told_ns = 0.0, now_ns
 
     def _exceeds_max_speed(self, demand: int, now_ns: int) -> bool:
-        speed, most = self._motor.speed(now_ns), self._personality.fastest(self._objects)
+        speed, most = self._motor.speed(now_ns), self._personality.speed_limit(self._objects)
         return most is not None and speed * demand > 0.0 and abs(speed) * _RPM > most
 
 
@@ -264,15 +264,15 @@ _LEAVING = {_S.READY_TO_SWITCH_ON: 0x605B, _S.SWITCHED_ON: 0x605C}
 _RESET = 0x80
 
 
-def command_of(word: int) -> Command:
+def command_of(controlword: int) -> Command:
     """Return the command in a controlword (CiA 402-2, table 27)."""
-    if not word & 2:
+    if not controlword & 2:
         return Command.DISABLE_VOLTAGE
-    if not word & 4:
+    if not controlword & 4:
         return Command.QUICK_STOP
-    if not word & 1:
+    if not controlword & 1:
         return Command.SHUTDOWN
-    return Command.ENABLE_OPERATION if word & 8 else Command.SWITCH_ON
+    return Command.ENABLE_OPERATION if controlword & 8 else Command.SWITCH_ON
 
 
 class PowerStage:
@@ -296,18 +296,18 @@ class PowerStage:
         self._word = 0
         self.state = PowerState.SWITCH_ON_DISABLED
 
-    def down(self) -> None:
+    def shut_down(self) -> None:
         """Enter `not ready to switch on`, as when the firmware stops."""
-        self._node.stop(_RAMP)
+        self._node.stop_timer(_RAMP)
         self.state = PowerState.NOT_READY
 
-    def control(self, word: int) -> bool:
+    def process_controlword(self, controlword: int) -> bool:
         """Process a controlword; return True only where it resets a fault: a rising bit 7 in the state `fault`."""
-        before, self._word = self._word, word
-        rising = bool(word & _RESET and not before & _RESET)
+        before, self._word = self._word, controlword
+        rising = bool(controlword & _RESET and not before & _RESET)
         if self.state is PowerState.FAULT:
             return rising
-        command = command_of(word)
+        command = command_of(controlword)
         target = TRANSITIONS.get((self.state, command))
         if target is None or (target in POWERED and not self.voltage):
             return False
@@ -346,7 +346,7 @@ class PowerStage:
         if coasting or self._node.objects.number(0x605E) == 0:
             end = self._motor.fail if coasting else self._motor.switch_off
             end(self._node.now_ns)
-            self._node.stop(_RAMP)
+            self._node.stop_timer(_RAMP)
             self.state = PowerState.FAULT
         elif self.state in (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE):
             self.state = PowerState.FAULT_REACTION_ACTIVE
@@ -354,23 +354,23 @@ class PowerStage:
         else:
             self.state = PowerState.FAULT
 
-    def supply(self, on: bool) -> None:
+    def switch_supply(self, on: bool) -> None:
         """Switch the power stage's supply on or off; without it the motor is off and powered states end."""
         self.voltage = on
         if not on:
             self._motor.switch_off(self._node.now_ns)
             if self.state in POWERED:
-                self._node.stop(_RAMP)
+                self._node.stop_timer(_RAMP)
                 faulty = self.state is PowerState.FAULT_REACTION_ACTIVE
                 self.state = PowerState.FAULT if faulty else PowerState.SWITCH_ON_DISABLED
 
-    def due(self, name: str) -> None:
-        """Go on with braking, or end it, if the timer that ran out is that of the ramp; ignore others."""
-        if name != _RAMP:
+    def timer_ran_out(self, timer: str) -> None:
+        """Go on with braking, or end it, if `timer`, which ran out, is that of the ramp; ignore others."""
+        if timer != _RAMP:
             return
         now = self._node.now_ns
         if now < self._ramp_ends_ns and abs(self._motor.speed(now)) > self._slow:
-            self._node.after(_RAMP, _MS)
+            self._node.start_timer(_RAMP, _MS)
             return
         if self.state is PowerState.FAULT_REACTION_ACTIVE:
             self._motor.switch_off(self._node.now_ns)
@@ -385,7 +385,7 @@ class PowerStage:
         return self._node.objects.number(0x605A) >= 5
 
     def _to(self, target: PowerState) -> None:
-        self._node.stop(_RAMP)
+        self._node.stop_timer(_RAMP)
         if self.state is PowerState.OPERATION_ENABLED and target is not PowerState.OPERATION_ENABLED:
             option = _LEAVING.get(target)
             if option is not None and self._node.objects.number(option):
@@ -403,7 +403,7 @@ class PowerStage:
         self._slow = max(_SLOW * speed, 1e-9 * _MS * deceleration / per_radian)
         self._ramp_ends_ns = now + _LONGEST_NS
         self._motor.brake(now)
-        self._node.after(_RAMP, max(_MS, round(1e9 * speed * per_radian / deceleration)))
+        self._node.start_timer(_RAMP, max(_MS, round(1e9 * speed * per_radian / deceleration)))
 
 
 BOOT_NS = 20_000_000  # from a reset to the boot-up message
@@ -539,7 +539,7 @@ class CanopenDrive:
             if not self._pdos.receive(identifier, frame.data):
                 return []
         elif 0x700 < identifier < 0x780:
-            self.nmt.heard(frame)
+            self.nmt.heartbeat_arrived(frame)
         return self._finish()
 
     def finish_sync(self, now_ns: int) -> list[Frame]:
@@ -547,7 +547,7 @@ class CanopenDrive:
         self._node.now_ns = now_ns
         if self._synced:
             self._synced = self._evaluated = False
-            self._pdos.act()  # limits depend on where the motor is, whether a torque has come or not
+            self._pdos.apply_received()  # limits depend on where the motor is, whether a torque has come or not
             if not self._evaluated and self.power.state is PowerState.OPERATION_ENABLED:
                 self._torque.evaluate(now_ns)
         return self._finish()
@@ -561,12 +561,12 @@ class CanopenDrive:
                 break
             self._node.now_ns = max(timers.pop(name), self._node.now_ns)
             for part in (self.nmt, self._makers, self._pdos, self.power, self.emergency, self._firmware):
-                part.due(name)
+                part.timer_ran_out(name)
             if name == _LOOP and self.power.state is PowerState.OPERATION_ENABLED:
                 self._sample(self._node.now_ns)
                 self._torque.evaluate(self._node.now_ns)
             self._refresh()
-            self._pdos.changes()
+            self._pdos.send_changes()
         self._node.now_ns = max(now_ns, self._node.now_ns)
         return self._finish()
 
@@ -598,37 +598,37 @@ class CanopenDrive:
             code: code of the emergency message, which is also in 603Fh.
             now_ns: present time [ns].
             lasting: whether it is the power stage that fails: the motor coasts at once, and no reset helps until
-                `repaired`.
+                `end_lasting_fault`.
         """
         self._node.now_ns = now_ns
         if lasting:
             self._failure = code
-        self.emergency.occurs(code)
+        self.emergency.add_error(code)
         self.power.trip(coasting=lasting)
         return self._finish()
 
-    def repaired(self) -> None:
+    def end_lasting_fault(self) -> None:
         """End a lasting fault; it still has to be reset."""
         self._failure = 0
 
-    def ignore_watchdogs(self, deaf: bool) -> None:
+    def ignore_watchdogs(self, ignored: bool) -> None:
         """Set whether a defect makes the drive go on although its host is gone."""
-        self.deaf = deaf
+        self.deaf = ignored
 
-    def warn(self, warned: bool, now_ns: int) -> list[Frame]:
+    def set_warning(self, active: bool, now_ns: int) -> list[Frame]:
         """Set or clear the warning bit of the statusword; return the frames that the drive sends."""
         self._node.now_ns = now_ns
-        self._warned = warned
+        self._warned = active
         return self._finish()
 
-    def supply(self, on: bool, now_ns: int) -> list[Frame]:
+    def switch_supply(self, on: bool, now_ns: int) -> list[Frame]:
         """Switch the motor's power, not the firmware's, on or off; return the frames, an emergency with them."""
         self._node.now_ns = now_ns
-        self.power.supply(on)
+        self.power.switch_supply(on)
         if on:
-            self.emergency.is_over(NO_VOLTAGE)
+            self.emergency.remove_errors(NO_VOLTAGE)
         else:
-            self.emergency.occurs(NO_VOLTAGE)
+            self.emergency.add_error(NO_VOLTAGE)
         return self._finish()
 
     def reboot(self, now_ns: int) -> list[Frame]:
@@ -645,13 +645,13 @@ class CanopenDrive:
 
     def _sync(self, data: bytes) -> None:
         if data:
-            self.emergency.occurs(SYNC_LENGTH)  # without a counter (1019h is 0) it has none (CiA 301, 7.2.5)
+            self.emergency.add_error(SYNC_LENGTH)  # without a counter (1019h is 0) it has none (CiA 301, 7.2.5)
             return
         if self.nmt.state is State.OPERATIONAL:
             self._makers.sync_arrived()
         self._sample(self._node.now_ns)
-        self._torque.tell_mean(self._node.now_ns)
-        self._pdos.sync()
+        self._torque.report_mean_torque(self._node.now_ns)
+        self._pdos.sync_arrived()
         self._synced = True
 
     def _sample(self, now_ns: int) -> None:
@@ -664,30 +664,30 @@ class CanopenDrive:
         """Handle objects that an RPDO or an SDO has set."""
         if self._personality.target in keys and self.nmt.state is State.OPERATIONAL:
             self._makers.target_arrived()
-        self._firmware.arrived(keys)
+        self._firmware.entries_written(keys)
         if self.power.state is PowerState.OPERATION_ENABLED:
             self._torque.evaluate(self._node.now_ns)
             self._evaluated = True
 
     def _control(self, word: int) -> None:
-        if self.power.control(word) and not self._failure:
+        if self.power.process_controlword(word) and not self._failure:
             self.power.reset_fault()
             waiting = {NO_HEARTBEAT} if self.nmt.silent_nodes else set()
             waiting |= {NO_VOLTAGE} if not self.power.voltage else set()
-            self.emergency.is_over(*[code for code in self.emergency.active if code not in waiting])
+            self.emergency.remove_errors(*[code for code in self.emergency.active if code not in waiting])
 
     def _late(self) -> None:
         self._abort_connection()
 
     def _lost(self, number: int) -> None:
-        self.emergency.occurs(NO_HEARTBEAT)
+        self.emergency.add_error(NO_HEARTBEAT)
         self._abort_connection()
         if self.objects.number(0x1029, 1) == 0 and self.nmt.state is State.OPERATIONAL:
             self.nmt.leave_operational()
 
     def _found(self, number: int) -> None:
         if not self.nmt.silent_nodes:
-            self.emergency.is_over(NO_HEARTBEAT)
+            self.emergency.remove_errors(NO_HEARTBEAT)
 
     def _abort_connection(self) -> None:
         if self.deaf:
@@ -706,7 +706,7 @@ class CanopenDrive:
         elif before is State.OPERATIONAL:
             self._pdos.stop()
             self._makers.stop()
-            self.emergency.is_over(RPDO_TIMEOUT)
+            self.emergency.remove_errors(RPDO_TIMEOUT)
             self._abort_connection()
         if before is State.INITIALISING and self.power.state is PowerState.NOT_READY:
             self.power.start()
@@ -715,7 +715,7 @@ class CanopenDrive:
         self._sdo.reset()
         self.emergency.reset()
         if command is nmt.Command.RESET_NODE:
-            self.power.down()
+            self.power.shut_down()
             self.motor.power_up(self._node.now_ns)
             self._like_new()
         else:
@@ -724,7 +724,7 @@ class CanopenDrive:
 
     def _like_new(self) -> None:
         self.objects.reset(_DRIVE_OBJECTS)
-        self.power.down()
+        self.power.shut_down()
         self._torque.release()
         self._communication_like_new()
 
@@ -795,9 +795,9 @@ class CanopenDrive:
     def _finish(self) -> list[Frame]:
         if self.nmt.state is not State.INITIALISING:
             self._refresh()
-            self._pdos.changes()
+            self._pdos.send_changes()
         closed = self.power.state is PowerState.OPERATION_ENABLED and self.objects.number(0x6061) == _CSP
         if closed and _LOOP not in self._node.timers:
-            self._node.after(_LOOP, _LOOP_NS)
+            self._node.start_timer(_LOOP, _LOOP_NS)
         out, self._node.out = self._node.out, []
         return out

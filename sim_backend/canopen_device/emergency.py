@@ -29,7 +29,7 @@ class Emergency:
         """Discard all errors without a message."""
         self.active.clear()
         self._waiting.clear()
-        self._node.stop(_INHIBIT)
+        self._node.stop_timer(_INHIBIT)
 
     @property
     def register(self) -> int:
@@ -39,7 +39,7 @@ class Emergency:
             bits |= GENERIC | _REGISTER.get(code >> 12, 0) | _REGISTER.get(code >> 8, 0)
         return bits
 
-    def occurs(self, code: int) -> None:
+    def add_error(self, code: int) -> None:
         """Add an error, record it in the history and send its emergency message; do nothing if it is active already."""
         if code in self.active:
             return
@@ -52,16 +52,16 @@ class Emergency:
         objects.put(0x603F, code)
         self._tell(code)
 
-    def is_over(self, *codes: int) -> None:
+    def remove_errors(self, *codes: int) -> None:
         """Remove errors; sends `error reset` if some of them were active."""
         gone = [code for code in self.active if code in codes]
         if gone:
             self.active = [code for code in self.active if code not in codes]
             self._tell(0)
 
-    def due(self, name: str) -> None:
-        """Send the next waiting emergency if the timer that ran out is that of the inhibit time; ignore others."""
-        if name == _INHIBIT and self._waiting:
+    def timer_ran_out(self, timer: str) -> None:
+        """Send the next waiting emergency if `timer`, which ran out, is that of the inhibit time; ignore others."""
+        if timer == _INHIBIT and self._waiting:
             self._transmit(self._waiting.pop(0))
 
     def _tell(self, code: int) -> None:
@@ -78,4 +78,4 @@ class Emergency:
         if not identifier & _INVALID:
             self._node.send(identifier & 0x7FF, message)
         if inhibit := objects.number(0x1015):
-            self._node.after(_INHIBIT, inhibit * _UNIT_NS)
+            self._node.start_timer(_INHIBIT, inhibit * _UNIT_NS)

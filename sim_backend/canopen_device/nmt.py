@@ -84,11 +84,11 @@ class Nmt:
         """Initialise the node, and send the boot-up message after a delay."""
         self.commanded = False
         self._to(State.INITIALISING)
-        self._node.stop(_PRODUCER)
-        self._node.stop(_LIFE)
+        self._node.stop_timer(_PRODUCER)
+        self._node.stop_timer(_LIFE)
         self._toggle = 0
         self.configure_consumers()
-        self._node.after(_BOOT, delay_ns)
+        self._node.start_timer(_BOOT, delay_ns)
 
     def command(self, data: bytes) -> None:
         """Process an NMT message; one of a wrong length, or for another node, has no effect."""
@@ -112,7 +112,7 @@ class Nmt:
 
     def configure_producer(self) -> None:
         """Apply a change of object 1017h; a new heartbeat begins at once."""
-        self._node.stop(_PRODUCER)
+        self._node.stop_timer(_PRODUCER)
         if self.state is not State.INITIALISING:
             self._send_heartbeat()
 
@@ -122,13 +122,13 @@ class Nmt:
         A heartbeat that is awaited no longer, or anew, is not missing.
         """
         for number in range(128):
-            self._node.stop(f"{_CONSUMER}{number}")
+            self._node.stop_timer(f"{_CONSUMER}{number}")
         while self.silent_nodes:
             self._found(self.silent_nodes.pop())
 
     def configure_guarding(self) -> None:
         """Apply a change of object 100Ch or 100Dh; guarding begins with the next request (CiA 301, 7.2.8.2.2.1)."""
-        self._node.stop(_LIFE)
+        self._node.stop_timer(_LIFE)
 
     def answer_guarding(self) -> None:
         """Answer a remote frame that asks for the state and await the next one; do nothing if heartbeats are sent."""
@@ -138,42 +138,42 @@ class Nmt:
         self._node.send(0x700 + self._node.number, bytes([self._toggle | self.state]))
         self._toggle ^= 0x80
         if life := objects.number(0x100C) * objects.number(0x100D):
-            self._node.after(_LIFE, life * _MS)
+            self._node.start_timer(_LIFE, life * _MS)
             if _HOST in self.silent_nodes:
                 self.silent_nodes.discard(_HOST)
                 self._found(_HOST)
 
-    def heard(self, frame: Frame) -> None:
+    def heartbeat_arrived(self, frame: Frame) -> None:
         """Process a heartbeat of another node: if it is awaited, start to wait for the next, and end its absence."""
         number = frame.identifier - 0x700
         for subindex in _CONSUMERS:
             entry = self._node.objects.number(0x1016, subindex)
             if entry >> 16 == number and entry & 0xFFFF:
-                self._node.after(f"{_CONSUMER}{number}", (entry & 0xFFFF) * _MS)
+                self._node.start_timer(f"{_CONSUMER}{number}", (entry & 0xFFFF) * _MS)
                 if number in self.silent_nodes:
                     self.silent_nodes.discard(number)
                     self._found(number)
 
-    def due(self, name: str) -> None:
-        """Act on the timer that ran out: send boot-up or heartbeat, or note that a guard or heartbeat is missing."""
-        if name == _BOOT:
+    def timer_ran_out(self, timer: str) -> None:
+        """Act on `timer`, which ran out: send boot-up or heartbeat, or note that a guard or heartbeat is missing."""
+        if timer == _BOOT:
             self._node.send(0x700 + self._node.number, b"\0")
             self._to(State.PRE_OPERATIONAL)
             self._send_heartbeat()
-        elif name == _PRODUCER:
+        elif timer == _PRODUCER:
             self._send_heartbeat()
-        elif name == _LIFE:
+        elif timer == _LIFE:
             self.silent_nodes.add(_HOST)
             self._lost(_HOST)
-        elif name.startswith(_CONSUMER):
-            number = int(name.removeprefix(_CONSUMER))
+        elif timer.startswith(_CONSUMER):
+            number = int(timer.removeprefix(_CONSUMER))
             self.silent_nodes.add(number)
             self._lost(number)
 
     def _send_heartbeat(self) -> None:
         if period := self._node.objects.number(0x1017):
             self._node.send(0x700 + self._node.number, bytes([self.state]))
-            self._node.after(_PRODUCER, period * _MS)
+            self._node.start_timer(_PRODUCER, period * _MS)
 
     def _to(self, state: State) -> None:
         if state is not self.state:

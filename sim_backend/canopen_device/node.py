@@ -31,10 +31,10 @@ class Node:
         """Queue a frame to send."""
         self.out.append(Frame(identifier, data))
 
-    def after(self, name: str, delay_ns: int) -> None:
+    def start_timer(self, timer: str, delay_ns: int) -> None:
         """Set the timer of this name to run out `delay_ns` from now; a running one starts again."""
-        self.timers[name] = self.now_ns + delay_ns
+        self.timers[timer] = self.now_ns + delay_ns
 
-    def stop(self, name: str) -> None:
+    def stop_timer(self, timer: str) -> None:
         """Stop the timer of this name; do nothing when it does not run."""
-        self.timers.pop(name, None)
+        self.timers.pop(timer, None)

@@ -91,7 +91,7 @@ def layout(objects: Objects, index: int, count: int | None = None) -> Layout:
 
 
 def check_write(objects: Objects, key: int, value: int) -> None:
-    """Raise SdoAbort where a host may not write this value into a PDO parameter now.
+    """Raise SdoAbort where a host may not write `value` into the PDO parameter `key` (index << 8 | sub-index) now.
 
     A PDO's identifier and mapping only change while it does not exist (bit 31), entries only while there are none.
     Where the identifier is fixed, the number of entries alone says whether it exists.
@@ -191,7 +191,7 @@ class Pdos:
         for number, index in enumerate(COMMUNICATION[0]):
             identifier = objects.number(index, 1)
             if not identifier or identifier & INVALID or (where := self._layout(MAPPING[0][number])) is None:
-                self._node.stop(f"{_DEADLINE}{number}")
+                self._node.stop_timer(f"{_DEADLINE}{number}")
                 continue
             rpdo = _Received(
                 number,
@@ -205,7 +205,7 @@ class Pdos:
         for number, index in enumerate(COMMUNICATION[1]):
             identifier = objects.number(index, 1)
             if not identifier or identifier & INVALID or (where := self._layout(MAPPING[1][number])) is None:
-                self._node.stop(f"{_EVENT}{number}")
+                self._node.stop_timer(f"{_EVENT}{number}")
                 continue
             before = lasts.get(number)
             self._tpdos.append(
@@ -222,7 +222,7 @@ class Pdos:
             )
 
     def start(self) -> None:
-        """Start PDOs as the node becomes operational; those sent on a change are sent once by the next `changes`."""
+        """Start PDOs as the node becomes operational; those sent on a change go out once by the next `send_changes`."""
         self._active = True
         for tpdo in self._tpdos:
             tpdo.last, tpdo.syncs = None, 0
@@ -234,7 +234,7 @@ class Pdos:
             for rpdo in group:
                 rpdo.waiting = None
         for name in [name for name in self._node.timers if name.startswith((_DEADLINE, _EVENT, _INHIBITED))]:
-            self._node.stop(name)
+            self._node.stop_timer(name)
 
     def receive(self, identifier: int, data: bytes) -> bool:
         """Process an RPDO's frame; return whether more may have changed at once than its data, which wait for SYNC."""
@@ -244,16 +244,16 @@ class Pdos:
         for rpdo in self.rpdos.get(identifier, ()):
             size = rpdo.layout.packing.size
             if len(data) < size:
-                self._emergency.occurs(PDO_SHORT)
+                self._emergency.add_error(PDO_SHORT)
                 changed = True
                 continue
             if len(data) > size:
-                self._emergency.occurs(PDO_LONG)
+                self._emergency.add_error(PDO_LONG)
                 changed = True
             elif self._emergency.active:
-                self._emergency.is_over(PDO_SHORT, PDO_LONG, RPDO_TIMEOUT)
+                self._emergency.remove_errors(PDO_SHORT, PDO_LONG, RPDO_TIMEOUT)
             if rpdo.deadline_ns:
-                self._node.after(f"{_DEADLINE}{rpdo.number}", rpdo.deadline_ns)
+                self._node.start_timer(f"{_DEADLINE}{rpdo.number}", rpdo.deadline_ns)
             window = self._node.objects.number(_WINDOW) * _US
             if rpdo.synchronous and window and self._node.now_ns - self._synced_ns > window:
                 continue
@@ -264,8 +264,8 @@ class Pdos:
                 changed = True
         return changed
 
-    def sync(self) -> None:
-        """Process a SYNC: send synchronous TPDOs with present values; `act` follows."""
+    def sync_arrived(self) -> None:
+        """Process a SYNC: send synchronous TPDOs with present values; `apply_received` follows."""
         self._synced_ns = self._node.now_ns
         if not self._active:
             return
@@ -280,7 +280,7 @@ class Pdos:
                 tpdo.syncs, tpdo.last = 0, data
                 self._node.send(tpdo.identifier, data)
 
-    def act(self) -> None:
+    def apply_received(self) -> None:
         """Apply what synchronous RPDOs have received since the last SYNC."""
         for group in self.rpdos.values():
             for rpdo in group:
@@ -288,7 +288,7 @@ class Pdos:
                     data, rpdo.waiting = rpdo.waiting, None
                     self._act(rpdo, data)
 
-    def changes(self) -> None:
+    def send_changes(self) -> None:
         """Send the TPDOs that are sent on a change, where their values have changed and no inhibit time runs."""
         if not self._active:
             return
@@ -298,15 +298,15 @@ class Pdos:
                 if data != tpdo.last:
                     self._event(tpdo, data)
 
-    def due(self, name: str) -> None:
-        """Act on the timer that ran out: an RPDO's deadline, a TPDO's event; inhibited ones go out by `changes`."""
-        if name.startswith(_DEADLINE):
-            self._emergency.occurs(RPDO_TIMEOUT)
+    def timer_ran_out(self, timer: str) -> None:
+        """Act on `timer`, which ran out: an RPDO's deadline, a TPDO's event; the inhibited wait for `send_changes`."""
+        if timer.startswith(_DEADLINE):
+            self._emergency.add_error(RPDO_TIMEOUT)
             self._late()
-        elif name.startswith(_EVENT):
-            tpdo = next(t for t in self._tpdos if t.number == int(name.removeprefix(_EVENT)))
+        elif timer.startswith(_EVENT):
+            tpdo = next(t for t in self._tpdos if t.number == int(timer.removeprefix(_EVENT)))
             if f"{_INHIBITED}{tpdo.number}" in self._node.timers:
-                self._node.after(name, tpdo.event_ns)
+                self._node.start_timer(timer, tpdo.event_ns)
             else:
                 self._event(tpdo, self._packed(tpdo))
 
@@ -314,9 +314,9 @@ class Pdos:
         tpdo.last = data
         self._node.send(tpdo.identifier, data)
         if tpdo.inhibit_ns:
-            self._node.after(f"{_INHIBITED}{tpdo.number}", tpdo.inhibit_ns)
+            self._node.start_timer(f"{_INHIBITED}{tpdo.number}", tpdo.inhibit_ns)
         if tpdo.event_ns:
-            self._node.after(f"{_EVENT}{tpdo.number}", tpdo.event_ns)
+            self._node.start_timer(f"{_EVENT}{tpdo.number}", tpdo.event_ns)
 
     def _act(self, rpdo: _Received, data: bytes) -> None:
         values = self._node.objects.values

@@ -66,8 +66,8 @@ class DriveProperties:
     motor: tuple[tuple[int, int], ...] = ()
     mode_when_on: bool = False
 
-    def reach(self, objects: Objects) -> int:
-        """Return the largest torque that all limits of the drive let through, the smallest of them [counts]."""
+    def torque_limit(self, objects: Objects) -> int:
+        """Return the smallest of the drive's torque limits [counts], at most 32767."""
         found = [0x7FFF]
         for key, per, below in self.limits:
             if key in objects.entries:
@@ -84,14 +84,14 @@ class DriveProperties:
             return 0
         return objects.number(self.target >> 8, self.target & 0xFF) >> self.shift
 
-    def fastest(self, objects: Objects) -> float | None:
+    def speed_limit(self, objects: Objects) -> float | None:
         """Return the speed limit above which no accelerating torque acts [turns per minute]; None without one."""
         if self.speed is None or self.speed[0] not in objects.entries:
             return None
         key, size = self.speed
         return objects.number(key >> 8, key & 0xFF) / size
 
-    def torque(self, counts: float, objects: Objects) -> float:
+    def torque_of_counts(self, counts: float, objects: Objects) -> float:
         """Convert counts of torque to [N m]."""
         if self.rated is None:
             return counts * self.scale
@@ -176,22 +176,22 @@ class Firmware:
         """Use the given node; `control` is called with each control word that takes effect."""
         self._node, self._personality, self._control = node, personality, control
 
-    def arrived(self, keys: tuple[int, ...]) -> None:
+    def entries_written(self, keys: tuple[int, ...]) -> None:
         """Apply a mode or control word among these entries just written: at once in the shipped drive, else delayed."""
         for key, name, delay in ((0x606000, _MODE, _MODE_NS), (0x604000, _CONTROL, _LOOP_NS)):
             if key in keys and self._personality.shipped:
-                self.due(name)
+                self.timer_ran_out(name)
             elif key in keys and name not in self._node.timers:
-                self._node.after(name, delay)
+                self._node.start_timer(name, delay)
 
-    def due(self, name: str) -> None:
-        """Let a control word or mode take effect if the timer that ran out is its delay; ignore others."""
+    def timer_ran_out(self, timer: str) -> None:
+        """Let a control word or mode take effect if `timer`, which ran out, is its delay; ignore others."""
         number = self._node.objects.number
-        if name == _CONTROL:
+        if timer == _CONTROL:
             self._control(number(0x6040))
-        elif name == _MODE and self._personality.mode_when_on and number(0x6041) & 0x6F not in _ON:
-            self._node.after(_MODE, _MODE_NS)
-        elif name == _MODE:
+        elif timer == _MODE and self._personality.mode_when_on and number(0x6041) & 0x6F not in _ON:
+            self._node.start_timer(_MODE, _MODE_NS)
+        elif timer == _MODE:
             mode = number(0x6060)
             if mode in self._personality.modes or (1 <= mode <= 32 and number(0x6502) >> (mode - 1) & 1):
                 self._node.objects.put(0x6061, mode)

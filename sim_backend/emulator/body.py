@@ -94,13 +94,13 @@ class Gears:
         needed = damping / squares.sum(axis=0)
         return np.asarray(np.where(squares > 0.0, needed, 0.0).max(axis=1))
 
-    def driven(self, motors: Vector) -> Vector:
+    def fully_driven_joints(self, motor_mask: Vector) -> Vector:
         """Return which joints have all of their motors among the given ones: 1 or 0, shape (joints,).
 
         Args:
-            motors: 1 for each of these, else 0, shape (motors,).
+            motor_mask: 1 for each of these, else 0, shape (motors,).
         """
-        return np.asarray(~((self.matrix != 0.0) & (motors == 0.0)[:, None]).any(axis=0), dtype=float)
+        return np.asarray(~((self.matrix != 0.0) & (motor_mask == 0.0)[:, None]).any(axis=0), dtype=float)
 
 
 # An interval of up to this many nominal periods is one step.
@@ -167,7 +167,7 @@ class Body:
         self._look()
         return self._speeds[motor]
 
-    def changes(self, now_ns: int) -> None:
+    def advance_before_change(self, now_ns: int) -> None:
         """Advance the plant, as `advance`, before a motor or a load changes now: the old state acts until then."""
         self.advance(now_ns)
 
@@ -224,7 +224,7 @@ class Body:
         """
         self._collect()
         if self._regular and not self.supported and self._prepared is None:
-            self._prepared = self._conditions(), self.plant.after(self._acting_torque())
+            self._prepared = self._conditions(), self.plant.state_after(self._acting_torque())
 
     @property
     def overdue_ns(self) -> int | None:
@@ -250,7 +250,7 @@ class Body:
             self.now_ns = end_ns
             return
         if prepared is not None and all(map(is_, prepared[0], self._conditions())):
-            self.plant.take(prepared[1])
+            self.plant.set_state(prepared[1])
         else:
             self.plant.step(self._acting_torque())
         self.now_ns += self._period_ns
@@ -284,10 +284,10 @@ class Body:
         if [power for power, _ in before] == [power for power, _ in outputs]:
             return
         powered = np.array([power is Power.TORQUE for power, _ in outputs], dtype=float)
-        self._driven = self.gears.driven(powered)
+        self._driven = self.gears.fully_driven_joints(powered)
         braked = np.array([motor.damping for motor in self.motors])
         damping = self.gears.joint_damping(braked)
-        self.plant.brake(damping if (damping != np.diag(np.diag(damping))).any() else np.diag(damping).copy())
+        self.plant.set_braking(damping if (damping != np.diag(np.diag(damping))).any() else np.diag(damping).copy())
 
     def _look(self) -> None:
         """Compute the motors' angles and speeds where the plant is; its arrays are replaced, never written into."""

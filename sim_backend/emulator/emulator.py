@@ -204,7 +204,7 @@ class Emulator:
             companion.press(key, now_ns)
         self._deadline = None
 
-    def go_on(self, now_ns: int) -> None:
+    def compute_ahead(self, now_ns: int) -> None:
         """Compute the arm's next step in advance, or advance the arm now where its cycle is overdue.
 
         Moving the arm takes longest; without this the answers to each cycle would come later, and late ones late.

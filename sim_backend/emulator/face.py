@@ -81,18 +81,18 @@ class EmulatedDevice(BusDevice, Protocol):
         """Evaluate the motor's torque and power again, after one of its defects has changed."""
 
     def fail(self, code: int, now_ns: int, *, lasting: bool = False) -> list[Frame]:
-        """Begin a fault with this error code, lasting until `repaired` or not; return the frames to send."""
+        """Begin a fault with this error code, lasting until `end_lasting_fault` or not; return the frames to send."""
 
-    def repaired(self) -> None:
+    def end_lasting_fault(self) -> None:
         """End a lasting fault's cause; the fault itself may still have to be reset."""
 
-    def ignore_watchdogs(self, deaf: bool) -> None:
+    def ignore_watchdogs(self, ignored: bool) -> None:
         """Set whether the drive goes on although its host is gone."""
 
-    def warn(self, warned: bool, now_ns: int) -> list[Frame]:
+    def set_warning(self, active: bool, now_ns: int) -> list[Frame]:
         """Set or clear a warning of the drive, and return the frames to send."""
 
-    def supply(self, on: bool, now_ns: int) -> list[Frame]:
+    def switch_supply(self, on: bool, now_ns: int) -> list[Frame]:
         """Switch the motors' power on or off, as an emergency stop does, and return the frames to send."""
 
     def reboot(self, now_ns: int) -> list[Frame]:

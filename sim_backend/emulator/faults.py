@@ -290,8 +290,10 @@ class Injection:
         sent: list[Sent] = []
         match fault.kind:
             case "load_attached":
-                self._body.changes(now_ns)
-                self._body.plant.load(tuple((f.size, f.offset) for f in self.active if f.kind == "load_attached"))
+                self._body.advance_before_change(now_ns)
+                self._body.plant.attach_loads(
+                    tuple((f.size, f.offset) for f in self.active if f.kind == "load_attached")
+                )
             case "bus_off" | "error_passive" if begins:
                 error = BUS_OFF if fault.kind == "bus_off" else ERROR_PASSIVE
                 return [Sent(bus, None, error, now_ns) for bus in sorted(set(self._buses))]
@@ -316,15 +318,15 @@ class Injection:
             case "drive_fault", True:
                 return face.fail(POWER_STAGE, now_ns, lasting=True)
             case "drive_fault", False:
-                face.repaired()
+                face.end_lasting_fault()
             case "emergency", True:
                 return face.fail(int(fault.size), now_ns)
             case "emergency_stop", _:
-                return face.supply(not begins, now_ns)
+                return face.switch_supply(not begins, now_ns)
             case "watchdog_ignored", _:
                 face.ignore_watchdogs(begins)
             case "warning", _:
-                return face.warn(begins, now_ns)
+                return face.set_warning(begins, now_ns)
             case "reboot", True:
                 return face.reboot(now_ns)
             case "node_silent", True:

@@ -304,12 +304,12 @@ def hold_emulated_arm(
 _begun: tuple[ArmConfig, LockStepArm] | None = None
 
 
-def from_config(config: ArmConfig, number: int) -> LockStepLink:
+def from_config(config: ArmConfig, bus_number: int) -> LockStepLink:
     """Open a bus of emulated drives in virtual time; the first bus builds the arm, later ones lead to it.
 
     Args:
         config: of the arm.
-        number: number of the bus; the first bus builds the arm, the others, opened after it, lead to the same arm.
+        bus_number: number of the bus; the first bus builds the arm, the others, opened after it, lead to the same arm.
 
     Raises:
         DriverError: as `LockStepArm`, or buses that are not opened in their order.
@@ -317,11 +317,11 @@ def from_config(config: ArmConfig, number: int) -> LockStepLink:
     global _begun
     arm = _standing.get(id(config))
     if arm is None:
-        if number == 0:
+        if bus_number == 0:
             _begun = (config, LockStepArm(config))
         if _begun is None or _begun[0] is not config:
-            raise DriverError(f"{config.name}: bus {number} was opened before bus 0")
+            raise DriverError(f"{config.name}: bus {bus_number} was opened before bus 0")
         arm = _begun[1]
-        if number == len(config.can_buses) - 1:
+        if bus_number == len(config.can_buses) - 1:
             _begun = None
-    return arm.link(number)
+    return arm.link(bus_number)

@@ -36,7 +36,7 @@ class Rotor(Protocol):
     def speed(self, motor: int, now_ns: int) -> float:
         """Return the speed of a motor at this time [rad/s]."""
 
-    def changes(self, now_ns: int) -> None:
+    def advance_before_change(self, now_ns: int) -> None:
         """Advance the arm to this time before something that moves it changes."""
 
 
@@ -138,9 +138,9 @@ class Motor:
         """Return the true speed [rad/s]."""
         return self._rotor.speed(self._index, now_ns)
 
-    def drive(self, torque: float, now_ns: int) -> None:
+    def drive(self, motor_torque: float, now_ns: int) -> None:
         """Apply this torque [N m at the motor] from now on, times the motor's own factor of acting to commanded."""
-        self._do(Power.TORQUE, torque * self._scale, now_ns)
+        self._do(Power.TORQUE, motor_torque * self._scale, now_ns)
 
     @property
     def damping(self) -> float:
@@ -169,5 +169,5 @@ class Motor:
         if self.defects.reversed:
             torque = -torque
         if power is not self.power or torque != self.torque:
-            self._rotor.changes(now_ns)
+            self._rotor.advance_before_change(now_ns)
             self.power, self.torque = power, torque

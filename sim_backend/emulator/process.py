@@ -398,7 +398,7 @@ class _Run:
                 self._send_ready_frames(emulator.tick(now))
                 self._streaming = now - heard_ns < _POLL_NS
                 if self._streaming:
-                    emulator.go_on(now)
+                    emulator.compute_ahead(now)
         finally:
             gc.unfreeze()
             if collecting:

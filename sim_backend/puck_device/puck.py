@@ -194,27 +194,27 @@ class EmulatedPuck:
         """Do nothing: a puck limits torque by its counts alone."""
 
     def fail(self, code: int, now_ns: int, *, lasting: bool = False) -> list[Frame]:
-        """Enter an error (STAT 1, no torque), which a host may clear, a `lasting` one after `repaired`; return []."""
+        """Enter an error (STAT 1, no torque); a host may clear it, if lasting after `end_lasting_fault`; return []."""
         self._stat, self._mode, self._told = Status.ERROR, Mode.IDLE, 0
         self.values["ERROR"] = code & 0x7FFF
         self._lasting = self._lasting or lasting
         self.evaluate(now_ns)
         return []
 
-    def repaired(self) -> None:
+    def end_lasting_fault(self) -> None:
         """End the cause of a lasting error, which a host may clear then."""
         self._lasting = False
 
-    def ignore_watchdogs(self, deaf: bool) -> None:
+    def ignore_watchdogs(self, ignored: bool) -> None:
         """Set whether the arm's safety puck goes on although the host is gone."""
-        self._safety.ignores_heartbeat = deaf
+        self._safety.ignores_heartbeat = ignored
 
-    def warn(self, warned: bool, now_ns: int) -> list[Frame]:
+    def set_warning(self, active: bool, now_ns: int) -> list[Frame]:
         """Set or clear the arm's warning of low supply voltage at the safety puck; return no frames."""
-        self._safety.low_supply(warned)
+        self._safety.set_low_supply(active)
         return []
 
-    def supply(self, on: bool, now_ns: int) -> list[Frame]:
+    def switch_supply(self, on: bool, now_ns: int) -> list[Frame]:
         """Release (on) or press (off) the emergency stop of the whole arm; return no frames."""
         self._safety.emergency_stop(not on, now_ns)
         return []

@@ -187,15 +187,15 @@ class EmulatedSafetyPuck:
             self._enter(SafetyMode.ESTOP, now_ns)
         self._pressed = pressed
 
-    def low_supply(self, low: bool) -> None:
+    def set_low_supply(self, is_low: bool) -> None:
         """Begin or end a supply voltage that is low enough for a warning."""
-        self._low_supply = low
+        self._low_supply = is_low
 
-    def watch_position(self, place: int, counts: int, now_ns: int) -> None:
+    def watch_position(self, puck_index: int, counts: int, now_ns: int) -> None:
         """Count a motor puck's position as traffic, and check the speed once all have sent theirs."""
         self._traffic_ns = now_ns
-        self._counts[place] = counts
-        if place == len(self._counts) - 1 and None not in self._counts:
+        self._counts[puck_index] = counts
+        if puck_index == len(self._counts) - 1 and None not in self._counts:
             self._watch_velocity([count for count in self._counts if count is not None], now_ns)
 
     @property

@@ -139,7 +139,7 @@ def test_an_error_lasts_as_long_on_either_wire(name: str) -> None:
         sender, listener = BusEndpoint("sender"), BusEndpoint("listener")
         medium.add(sender)
         medium.add(listener)
-        medium.destroy(1)
+        medium.destroy_next(1)
         frame = Frame(0x201, bytes(8), fd=data_bitrate is not None)
         medium.offer(sender, frame, 0)
         medium.advance(10**9)

@@ -181,7 +181,7 @@ def test_a_port_hears_what_its_filters_say(filters: tuple[tuple[int, int], ...],
 
 def test_a_destroyed_frame_is_sent_again_and_costs_its_time() -> None:
     medium, (sender, listener) = on_wire(2, 1_000_000)
-    medium.destroy(1, sender)
+    medium.destroy_next(1, sender)
     medium.offer(sender, Frame(0x080), 0)
     medium.advance(10**9)
     assert heard(listener) == [Frame(0x080, stamp_ns=51_000 + 20_000 + 51_000)]
@@ -190,7 +190,7 @@ def test_a_destroyed_frame_is_sent_again_and_costs_its_time() -> None:
 
 def test_a_controller_that_never_succeeds_warns_turns_passive_and_leaves_the_bus() -> None:
     medium, (sender, listener) = on_wire(2, 1_000_000)
-    medium.destroy(1000, sender)
+    medium.destroy_next(1000, sender)
     medium.offer(sender, Frame(0x080), 0)
     medium.advance(10**12)
     told = heard(sender)
@@ -207,7 +207,7 @@ def test_a_controller_that_never_succeeds_warns_turns_passive_and_leaves_the_bus
     medium.advance(2 * 10**12)
     assert heard(sender) == []
     assert heard(listener) == []
-    medium.destroy(0, sender)
+    medium.destroy_next(0, sender)
     medium.restart(sender, 3 * 10**12)
     medium.offer(sender, Frame(0x100), 3 * 10**12)
     medium.advance(4 * 10**12)

@@ -240,8 +240,8 @@ def test_one_drive_that_does_not_follow_takes_the_others_back(command: int, miss
     bench = Bench(weightless_config())
     with bench.arm as arm:
         power = bench.drive(1).power
-        obey = power.control
-        power.control = lambda word: word != command and obey(word)  # type: ignore[method-assign]
+        obey = power.process_controlword
+        power.process_controlword = lambda word: word != command and obey(word)  # type: ignore[method-assign]
         begun = arm.clock.now_ns()
         with pytest.raises(DriverError, match=rf"not {missed} within 0.5 s: slide: drive 2 is in the state"):
             arm.enable()

@@ -292,7 +292,7 @@ def test_drives_that_a_dead_host_has_left_enabled_are_braked_before_they_are_con
 def test_a_drive_that_goes_on_is_named_and_nothing_is_opened() -> None:
     bench = left_enabled()
     bench.taps = tapped(bench.behind, bench.config)
-    bench.drive(1)._firmware.arrived = lambda keys: None  # type: ignore[method-assign]
+    bench.drive(1)._firmware.entries_written = lambda keys: None  # type: ignore[method-assign]
     with pytest.raises(DriverError, match="slide: drive 2: left enabled by another host, and goes on although told"):
         CanopenArm(bench.config, lambda _: bench.taps).open()
     assert bench.drive(0).power.state is PowerState.SWITCH_ON_DISABLED

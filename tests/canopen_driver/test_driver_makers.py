@@ -257,7 +257,9 @@ def test_a_drive_that_falls_into_another_mode_is_not_enabled() -> None:
     bench = Bench(arm_of("maxon_epos4_50-8_0110h.eds"))
     with bench.arm as arm:
         face = bench.behind.emulator.faces[1]
-        face._firmware.due = lambda name: face._control(face.objects.number(0x6040)) if name == "control word" else None  # type: ignore[attr-defined]
+        face._firmware.timer_ran_out = lambda timer: (
+            face._control(face.objects.number(0x6040)) if timer == "control word" else None
+        )  # type: ignore[attr-defined]
         face.objects.put(0x6061, 1)  # type: ignore[attr-defined]
         with pytest.raises(
             DriverError, match=r"not enabled: slide: drive 2 is in mode 1 \(6061h\) although 10 was set"

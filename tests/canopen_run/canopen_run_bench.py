@@ -26,7 +26,7 @@ from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.command_channel import StopCondition
 from ident_service.motion.run import RunReport, run
-from ident_service.registry.state_folder import fault_file
+from ident_service.registry.state_folder import arm_fault_store
 from sim_backend.emulator.faults import parse_fault
 from sim_backend.emulator.lock_step import LockStepArm
 
@@ -55,7 +55,7 @@ STALLS = (
 
 def acknowledge(arm: Path, name: str, state: Path) -> None:
     """Acknowledge whatever is latched."""
-    for code in fault_file(state, name).latched():
+    for code in arm_fault_store(state, name).latched():
         assert main(["ack", str(arm), code, "--state", str(state)]) == 0
 
 

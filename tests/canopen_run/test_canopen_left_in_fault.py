@@ -142,7 +142,7 @@ def test_a_fault_of_its_own_that_comes_with_the_farewell_is_not_reset_away(
     tripped = face.power.trip
 
     def trips(*, coasting: bool = False) -> None:
-        face.emergency.occurs(0x4310)
+        face.emergency.add_error(0x4310)
         tripped(coasting=coasting)
 
     face.power.trip = trips  # type: ignore[method-assign]

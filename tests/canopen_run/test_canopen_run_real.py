@@ -41,7 +41,7 @@ from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.last_position import FILE, PositionFile
 from ident_service.motion.run import keep_host_alive
 from ident_service.recordings.open import open_recording
-from ident_service.registry.state_folder import arm_folder, fault_file
+from ident_service.registry.state_folder import arm_fault_store, arm_folder
 
 NAME, RATE, KP, KD = "far", 50.0, 100.0, 16.0
 DEADLINE, BRAKING = 0.2, [4.0, 2.0]
@@ -60,7 +60,7 @@ class Bench:
         tree = canopen(described(name, rate, KP, KD), bus, 1, torque_deadline=DEADLINE, **driver)
         tree["driver"]["emulation"]["braking"] = BRAKING  # it sinks to rest in a few seconds
         self.arm = write(folder, tree)
-        self.faults = fault_file(self.state, name)
+        self.faults = arm_fault_store(self.state, name)
         self._runs = 0
         for _ in range(TRIES):
             with emulated(self.arm):

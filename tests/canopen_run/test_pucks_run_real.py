@@ -20,7 +20,7 @@ from ident_service.config.load import load_arm
 from ident_service.model.arm_model import arm_model
 from ident_service.model.base_parameters import base_parameters
 from ident_service.recordings.open import open_recording
-from ident_service.registry.state_folder import fault_file
+from ident_service.registry.state_folder import arm_fault_store
 
 NAME, RATE, KP, KD = "farpucks", 50.0, 100.0, 16.0
 NAMES = ("shoulder", "elbow")
@@ -65,7 +65,7 @@ class Bench:
         bus = {"interface": "ident_wire", "channel": channel()}
         emulation = {"operator": 0.3, "heartbeat": 0.25, "braking": [4.0, 2.0], "zeroed": False}
         self.arm = write(folder, puck_arm(NAME, RATE, KP, KD, bus, heartbeat=0.4, emulation=emulation))
-        self.faults = fault_file(self.state, NAME)
+        self.faults = arm_fault_store(self.state, NAME)
         self.runs = 0
 
     def run(self) -> tuple[Said, Path]:

@@ -16,7 +16,7 @@ from ident_service.config.load import load_arm
 from ident_service.model.arm_model import arm_model
 from ident_service.model.base_parameters import base_parameters
 from ident_service.recordings.open import open_recording
-from ident_service.registry.state_folder import fault_file
+from ident_service.registry.state_folder import arm_fault_store
 
 RATE, KP, KD = 250.0, 225.0, 30.0
 LOCK_STEP = {"interface": "lock_step", "channel": "pucks"}
@@ -69,7 +69,7 @@ def test_a_velocity_fault_in_the_middle_of_a_run_is_latched_and_its_recording_ca
     assert main(["run", str(path), "--out", str(run), "--state", str(state)]) == 4
     said = capsys.readouterr()
     assert "the pendant shows velocity fault" in said.err
-    assert "drive_emergency" in fault_file(state, name).latched()
+    assert "drive_emergency" in arm_fault_store(state, name).latched()
     blocks = list(open_recording(run / "run.mcap", NAMES).blocks())
     assert sum(len(block.position) for block in blocks) > RATE
     assert main(["run", str(path), "--out", str(tmp_path / "again"), "--state", str(state)]) == 3

@@ -16,7 +16,7 @@ from ident_service.config.load import load_arm
 from ident_service.errors import DriverError
 from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.command_channel import ControlFile, Homing, InterruptibleArm
-from ident_service.registry.state_folder import control_path, fault_file
+from ident_service.registry.state_folder import arm_fault_store, control_path
 
 
 @pytest.mark.parametrize("verb", ["check", "watch"])
@@ -60,7 +60,7 @@ def test_an_arm_whose_description_is_a_daemons_is_stopped_by_its_name(ident: Ide
     again = ident("stop", "uploaded", "--json")
     assert (again.code, again.json["pid"]) == (0, None)
     assert "uploaded is not moving" in ident("stop", "uploaded").out
-    fault_file(state, "uploaded").latch("lease_lost", "nobody was there")
+    arm_fault_store(state, "uploaded").latch("lease_lost", "nobody was there")
     assert ident("ack", "uploaded", "lease_lost").code == 0
     assert ident("stop", "../uploaded").code == 2
 
@@ -114,7 +114,7 @@ def test_home_leads_an_arm_that_another_process_holds(ident: Ident, state: Path,
 @pytest.mark.campaign
 @pytest.mark.slow
 def test_a_check_comes_after_the_faults(ident: Ident, state: Path) -> None:
-    fault_file(state, "planar2").latch("lease_lost", "nobody was there")
+    arm_fault_store(state, "planar2").latch("lease_lost", "nobody was there")
     ended = ident("check", "planar2", "--confirm", "planar2")
     assert ended.code == 3
     assert "`ident acknowledge planar2 lease_lost`" in ended.err

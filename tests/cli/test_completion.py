@@ -14,7 +14,7 @@ import pytest
 from cli.conftest import Ident
 
 from ident_service.motion.fault_store import FaultStore
-from ident_service.registry.arms import know_shipped
+from ident_service.registry.arms import register_shipped_arms
 from ident_service.registry.database import Database
 from ident_service.registry.jobs import add_job
 
@@ -46,8 +46,8 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (state / place).mkdir(parents=True)
     FaultStore(state / "arms" / "planar2").latch("following_error", "j1 lags")
     with Database(state) as db:
-        know_shipped(db)
-        add_job(db, "20260103T000000Z-planar2-def", "run", "planar2", {}, [], "ann", motion=True, run=None)
+        register_shipped_arms(db)
+        add_job(db, "20260103T000000Z-planar2-def", "run", "planar2", {}, [], "ann", motion=True, run_id=None)
     return state
 
 

@@ -244,7 +244,7 @@ def test_recordings_behind_an_accepted_set_of_another_run_stay(db: Database, sta
 def test_recordings_that_a_job_reads_stay(db: Database, state: Path, folder: Path) -> None:
     import_run(db, state, folder, "me")
     asked = {"kind": "identify", "recordings": [{"run": folder.name}]}
-    job = rows.add_job(db, "identify-1", "identify", "quick", asked, [], "me", motion=False, run="another")
+    job = rows.add_job(db, "identify-1", "identify", "quick", asked, [], "me", motion=False, run_id="another")
     assert prunable_recordings(db, state, 0) == []
-    rows.ended(db, job["id"], "done", "", 0)
+    rows.mark_ended(db, job["id"], "done", "", 0)
     assert {one.run for one in prunable_recordings(db, state, 0)} == {folder.name}

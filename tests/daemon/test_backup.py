@@ -377,10 +377,10 @@ def test_the_one_file_has_everything_when_nobody_writes(
     with closing(sqlite3.connect(registry)) as other:
         other.execute("BEGIN IMMEDIATE")
         began = time.monotonic()
-        db.rest()  # waits for nobody
+        db.checkpoint_when_idle()  # waits for nobody
         assert time.monotonic() - began < 1.0
         other.execute("ROLLBACK")
-    db.rest()
+    db.checkpoint_when_idle()
     assert registry.with_name(f"{FILE}-wal").stat().st_size == 0
 
 

@@ -70,7 +70,7 @@ def test_a_run_ends_early(daemon: Asked, patient: str, state: Path, asked: str) 
             answer = daemon.post(f"/api/v1/arms/{ARM}/{word}")
             assert (answer.status_code, answer.json()) == (200, {"arm": ARM, "asked": word, "reached": True})
         assert daemon.service.engine.audit.flush(10.0)
-        assert [line["what"] for line in audit_log(daemon.service.db, most=len(words))] == words[::-1]
+        assert [line["what"] for line in audit_log(daemon.service.db, max_lines=len(words))] == words[::-1]
     ended = daemon.follow(job, lease=True)
     assert ended["state"] == "done", ended
     report = daemon.get(f"/api/v1/jobs/{job}/result").json()["answer"]["report"]
@@ -257,13 +257,13 @@ def test_positions_of_an_arm_at_rest_are_reported_while_they_are_read(daemon: As
 def test_why_an_arm_could_not_be_read_stands_on_its_page(daemon: Asked, arm: str) -> None:
     for state, detail in (("done", ""), ("failed", "the drive of elbow does not answer"), ("queued", "")):
         name = f"j-{state}"
-        rows.add_job(daemon.service.db, name, "watch", arm, {}, [], "me", motion=False, run=None)
+        rows.add_job(daemon.service.db, name, "watch", arm, {}, [], "me", motion=False, run_id=None)
         if state != "queued":
-            rows.ended(daemon.service.db, name, state, detail, 1)
+            rows.mark_ended(daemon.service.db, name, state, detail, 1)
     assert "It could not be read at" in (page := daemon.get(f"/arms/{arm}").text)
     assert "the drive of elbow does not answer" in page
-    rows.add_job(daemon.service.db, "j-later", "watch", arm, {}, [], "me", motion=False, run=None)
-    rows.ended(daemon.service.db, "j-later", "done", "", 0)
+    rows.add_job(daemon.service.db, "j-later", "watch", arm, {}, [], "me", motion=False, run_id=None)
+    rows.mark_ended(daemon.service.db, "j-later", "done", "", 0)
     assert "It could not be read" not in daemon.get(f"/arms/{arm}").text
 
 

@@ -99,7 +99,7 @@ def kill_once(state: Path, seed: int) -> str:
         process.kill()
         process.wait()
     with Database(state) as db:
-        assert db.sound()
+        assert db.is_intact()
         before = {row["id"]: row["state"] for row in db.rows("SELECT id, state FROM jobs")}
     assert not alive or before[job] in ("running", "done")
     with serving(state) as again:
@@ -132,7 +132,7 @@ def kill_once(state: Path, seed: int) -> str:
         lines = again.get("/api/v1/audit?most=500").json()
         assert [line["about"] for line in lines if line["what"] == "job created"].count(job) == 1
     with Database(state) as db:
-        assert db.sound()
+        assert db.is_intact()
         assert not db.rows("SELECT id FROM jobs WHERE state IN ('queued', 'running')")
     return f"{kind}: {seen['state']}: {seen['detail']}"
 

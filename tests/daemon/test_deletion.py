@@ -21,7 +21,7 @@ from ident_service.operations.maintenance_schedule import DueRule, add_schedule,
 from ident_service.registry import jobs
 from ident_service.registry.database import Database, audit_log
 from ident_service.registry.runs import index_run, operating_seconds
-from ident_service.registry.state_folder import control_path, fault_file
+from ident_service.registry.state_folder import arm_fault_store, control_path
 
 FIRST, SECOND, THIRD = (f"2026010{day}T000000Z-quick" for day in (1, 2, 3))
 
@@ -85,8 +85,8 @@ def test_the_page_of_the_arm_forgets_what_is_deleted(filled: Asked) -> None:
     db = filled.service.db
     for number, (kind, run) in enumerate((("run", FIRST), ("identify", SECOND))):
         asked = {"recordings": [{"run": FIRST}]} if kind == "identify" else {}
-        jobs.add_job(db, f"j{number}", kind, "quick", asked, [], "test", motion=False, run=run)
-        assert jobs.ended(db, f"j{number}", "done", "")
+        jobs.add_job(db, f"j{number}", kind, "quick", asked, [], "test", motion=False, run_id=run)
+        assert jobs.mark_ended(db, f"j{number}", "done", "")
     arm = load_arm(
         filled.service.state / str(db.rows("SELECT folder FROM arms WHERE name = 'quick'")[0]["folder"]) / "arm.yaml"
     )
@@ -111,10 +111,10 @@ def test_what_is_in_use_is_not_deleted(filled: Asked, monkeypatch: pytest.Monkey
         assert delete(filled, f"runs/{SECOND}")[0] == 200
         assert filled.post(f"/api/v1/jobs/{job}/cancel").status_code == 200
     filled.follow(job)
-    fault_file(state, "quick").latch("overspeed", "too fast")
+    arm_fault_store(state, "quick").latch("overspeed", "too fast")
     status, answer = delete(filled, "arms/quick?anyway=true")
     assert (status, "overspeed" in answer["error"]["message"]) == (409, True)
-    fault_file(state, "quick").acknowledge("overspeed")
+    arm_fault_store(state, "quick").acknowledge("overspeed")
     with ControlFile.take(control_path(state, "quick"), None):
         status, answer = delete(filled, "arms/quick?anyway=true")
         assert (status, "being moved" in answer["error"]["message"]) == (409, True)

@@ -16,7 +16,7 @@ from ident_service.client import Event, IdentClient
 from ident_service.daemon.news import LOOK, EventPoller
 from ident_service.motion.command_channel import ControlFile
 from ident_service.registry.database import audit_log, note
-from ident_service.registry.state_folder import control_path, fault_file
+from ident_service.registry.state_folder import arm_fault_store, control_path
 
 
 class Clock:
@@ -70,7 +70,7 @@ def test_who_is_far_behind_reads_the_registry(
         page = watch.earlier(seen)
         assert len(page) <= 7
         told += numbers(page)
-    assert told == [line["id"] for line in reversed(audit_log(db, most=500))]
+    assert told == [line["id"] for line in reversed(audit_log(db, max_lines=500))]
     # A number that there never was is of another registry: it begins now.
     assert watch.begin(10**6).line == told[-1]
 
@@ -78,7 +78,7 @@ def test_who_is_far_behind_reads_the_registry(
 @pytest.mark.slow
 def test_a_new_listener_gets_the_state_of_arms_and_jobs(daemon: Asked, watch: EventPoller) -> None:
     state = daemon.service.state
-    fault_file(state, "planar2").latch("overspeed", "too fast")
+    arm_fault_store(state, "planar2").latch("overspeed", "too fast")
     with ControlFile.take(control_path(state, "wam7_sim"), None):
         job = daemon.begin({"kind": "base", "arm": "planar2"})
         watch.poll()

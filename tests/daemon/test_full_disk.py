@@ -34,14 +34,14 @@ from ident_service.registry.state_folder import control_path
 def test_the_end_of_a_job_waits_for_room(
     daemon: Asked, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    ended, full = rows.ended, [True]
+    ended, full = rows.mark_ended, [True]
 
     def without_room(*arguments: Any) -> bool:
         if full[0]:
             raise sqlite3.OperationalError("database or disk is full")
         return ended(*arguments)
 
-    monkeypatch.setattr(rows, "ended", without_room)
+    monkeypatch.setattr(rows, "mark_ended", without_room)
     monkeypatch.setattr("ident_service.daemon.jobs.queue._AGAIN", 0.05)
     assert daemon.get("/healthz").status_code == 200
     job = daemon.begin({"kind": "base", "arm": "planar2"})
@@ -75,7 +75,7 @@ def test_the_end_of_a_job_waits_for_room(
 def test_who_waits_for_a_job_is_told_that_its_end_cannot_be_entered(
     state: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    ended = rows.ended
+    ended = rows.mark_ended
 
     def without_room(*arguments: Any) -> bool:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -83,7 +83,7 @@ def test_who_waits_for_a_job_is_told_that_its_end_cannot_be_entered(
     monkeypatch.setattr("ident_service.client.client.UNENTERED", 0.1)
     monkeypatch.setattr("ident_service.daemon.jobs.queue._AGAIN", 0.05)
     with listening(state) as reached, IdentClient(reached.url, reached.token) as client:
-        monkeypatch.setattr(rows, "ended", without_room)
+        monkeypatch.setattr(rows, "mark_ended", without_room)
         assert main(["base-parameters", "planar2", "--server", client.url]) == 1
         said = capsys.readouterr()
         remedy = "it has ended (done), but that cannot be entered: the disk of the daemon's state folder is full; free"
@@ -95,7 +95,7 @@ def test_who_waits_for_a_job_is_told_that_its_end_cannot_be_entered(
         (live,) = reached.service.engine.live.entered()
         live.exit_code = 4
         assert main(["jobs", "watch", job.id, "--server", client.url]) == 4
-        monkeypatch.setattr(rows, "ended", ended)
+        monkeypatch.setattr(rows, "mark_ended", ended)
         wait_for(lambda: not client.job(job.id).live)
         assert not client.job(job.id).unentered
 

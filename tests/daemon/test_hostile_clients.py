@@ -363,7 +363,7 @@ def test_a_recording_that_is_deleted_while_it_is_completed_is_unknown(
 @pytest.mark.slow
 def test_an_arm_that_is_added_while_it_is_deleted_is_whole(daemon: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
     known_arm(daemon, quick_text())
-    know, adding = deletion.know_shipped, list[threading.Thread]()
+    know, adding = deletion.register_shipped_arms, list[threading.Thread]()
 
     def meanwhile(db: Database) -> None:
         know(db)
@@ -379,7 +379,7 @@ def test_an_arm_that_is_added_while_it_is_deleted_is_whole(daemon: Asked, monkey
             adding[0].join(30)
         return hide(folders)
 
-    monkeypatch.setattr(deletion, "know_shipped", meanwhile)
+    monkeypatch.setattr(deletion, "register_shipped_arms", meanwhile)
     monkeypatch.setattr(deletion, "_hidden", slowly)
     assert daemon.ask("DELETE", "/api/v1/arms/quick").status_code == 200
     adding[0].join(60)

@@ -48,8 +48,8 @@ def fill_events(db: Database, number: int) -> None:
 
 
 def fill_jobs(db: Database, number: int) -> None:
-    rows.add_job(db, f"j{number}", "base", "planar2", {}, [], "me", motion=False, run=None)
-    rows.ended(db, f"j{number}", "done", "")
+    rows.add_job(db, f"j{number}", "base", "planar2", {}, [], "me", motion=False, run_id=None)
+    rows.mark_ended(db, f"j{number}", "done", "")
 
 
 def fill_audit(db: Database, number: int) -> None:

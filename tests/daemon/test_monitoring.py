@@ -13,7 +13,7 @@ import yaml
 from daemon.conftest import Asked
 from prometheus_client.parser import text_string_to_metric_families
 
-from ident_service.registry.state_folder import fault_file
+from ident_service.registry.state_folder import arm_fault_store
 
 FOLDER = Path(__file__).parents[2] / "configs" / "monitoring"
 _NAME = re.compile(r"\b(?:ident|process)_[a-z_]+\b")
@@ -40,7 +40,7 @@ def expressions() -> Iterator[str]:
 @pytest.fixture
 def figures(daemon: Asked) -> dict[str, set[str]]:
     """Names of samples that the daemon tells of, each with its labels."""
-    fault_file(daemon.service.state, "planar2").latch("overspeed", "too fast")
+    arm_fault_store(daemon.service.state, "planar2").latch("overspeed", "too fast")
     daemon.post("/api/v1/stop")
     metrics = daemon.service.metrics
     metrics.record_lease_age(0.5)

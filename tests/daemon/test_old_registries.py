@@ -53,7 +53,7 @@ def test_an_upgrade_keeps_every_value_and_makes_the_newest_tables(tmp_path: Path
         raw.row_factory = sqlite3.Row
         before = {table: [dict(row) for row in raw.execute(all_of(table))] for table in columns(raw)}
     with Database(state) as db:
-        assert db.sound()
+        assert db.is_intact()
         assert db.row("PRAGMA user_version") == {"user_version": len(MIGRATIONS)}
         for table, rows in before.items():
             now = db.rows(all_of(table))

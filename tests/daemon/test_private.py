@@ -22,7 +22,7 @@ from ident_service.daemon.settings import Settings
 from ident_service.errors import UsageError
 from ident_service.motion.command_channel import ControlFile
 from ident_service.registry.database import FILE, Database, audit_log
-from ident_service.registry.state_folder import control_path, fault_file
+from ident_service.registry.state_folder import arm_fault_store, control_path
 from ident_service.registry.tokens import add_token
 
 
@@ -93,7 +93,7 @@ def test_what_a_verb_writes_is_its_owners_alone(entered: Path) -> None:
     assert main([*VERBS[0], "--state", str(entered)]) == 0
     os.umask(0o077)
     for code in ("late_cycle", "lease_lost"):
-        fault_file(entered, "planar2").latch(code, "test")
+        arm_fault_store(entered, "planar2").latch(code, "test")
     os.umask(0o022)
     assert main(["ack", "planar2", "late_cycle", "--state", str(entered)]) == 0  # which writes the file anew
     assert readable(entered) == []

@@ -109,16 +109,16 @@ def test_what_was_written_survives_a_kill(tmp_path: Path) -> None:
     assert subprocess.run([sys.executable, "-c", script, tmp_path], check=False).returncode == -9
     with Database(tmp_path) as db:
         assert [line["what"] for line in audit_log(db)] == ["written"]
-        assert db.sound()
+        assert db.is_intact()
 
 
 def test_a_job_ends_once(tmp_path: Path) -> None:
     with Database(tmp_path) as db:
-        jobs.add_job(db, "j", "run", "a", {}, [], "me", motion=True, run=None)
-        assert jobs.started(db, "j", "")
-        assert not jobs.started(db, "j", "")
-        assert jobs.ended(db, "j", "faulted", "why", 4)
-        assert not jobs.ended(db, "j", "done", "")
+        jobs.add_job(db, "j", "run", "a", {}, [], "me", motion=True, run_id=None)
+        assert jobs.mark_started(db, "j", "")
+        assert not jobs.mark_started(db, "j", "")
+        assert jobs.mark_ended(db, "j", "faulted", "why", 4)
+        assert not jobs.mark_ended(db, "j", "done", "")
         assert jobs.known_job(db, "j")["state"] == "faulted"
         with pytest.raises(UnknownId):
             jobs.known_job(db, "k")
@@ -128,10 +128,10 @@ def test_typical_durations_are_medians_of_what_came_to_its_end(tmp_path: Path) -
     with Database(tmp_path) as db:
         assert jobs.typical_seconds(db, "run", "a") is None
         for number, (seconds, state) in enumerate([(10, "done"), (12, "done"), (500, "done"), (1, "failed")]):
-            jobs.add_job(db, str(number), "run", "a", {}, [], "me", motion=True, run=None)
+            jobs.add_job(db, str(number), "run", "a", {}, [], "me", motion=True, run_id=None)
             db.write("UPDATE jobs SET state = ?, started = 0, ended = ? WHERE id = ?", state, seconds, str(number))
-        jobs.add_job(db, "waited", "run", "a", {}, [], "me", motion=True, run=None)
-        assert jobs.ended(db, "waited", "refused", "its confirmation was too old")
+        jobs.add_job(db, "waited", "run", "a", {}, [], "me", motion=True, run_id=None)
+        assert jobs.mark_ended(db, "waited", "refused", "its confirmation was too old")
         assert jobs.typical_seconds(db, "run", "a") == 12
         assert jobs.typical_seconds(db, "run", "b") is None
 

@@ -28,7 +28,7 @@ from ident_service.cli.remote import follow, remote_verbs
 from ident_service.cli.remote_watching import named_files
 from ident_service.client import IdentClient
 from ident_service.errors import ArmError, ConfigError, MotionRefused, Problem, UnknownId, UsageError
-from ident_service.registry.state_folder import fault_file
+from ident_service.registry.state_folder import arm_fault_store
 
 RUN = "20260101T000000Z-quick"
 SINGULAR = "20260103T000000Z-quick"
@@ -393,7 +393,7 @@ def test_a_person_elsewhere_reads_what_one_at_the_machine_does(
         assert main(["config", "check", "quick", *server]) == 0
         assert "\nnext: ident preflight quick --state " in capsys.readouterr().out
         # The commands that are named can be given as they stand.
-        fault_file(state, "quick").latch("late_cycle", "a cycle came late")
+        arm_fault_store(state, "quick").latch("late_cycle", "a cycle came late")
         assert main(["preflight", "quick", "--confirm", "quick", *server]) != 0
         assert "\nnext: ident recover quick --state " in capsys.readouterr().out
         assert main(["recover", "quick", *server]) == 3

@@ -18,7 +18,7 @@ from daemon.verbs_bench import ON_A_BUS, on_a_bus, unstable_text
 import ident_service.cli
 from ident_service.cli import main
 from ident_service.motion.command_channel import ControlFile
-from ident_service.registry.state_folder import control_path, fault_file
+from ident_service.registry.state_folder import arm_fault_store, control_path
 
 RUN, OTHER = "20260101T000000Z-quick", "20260102T000000Z-quick"
 PARAMETERS = f"{RUN}/parameters.json"
@@ -125,7 +125,7 @@ def test_answers_at_an_arm_are_the_same(said: Said, state: Path) -> None:
     assert "\nfiles: runs/ID\n  arm.json\n" in said("run", "ARM", "--confirm", "quick")
 
     def latch() -> None:
-        fault_file(state, "quick").latch("late_cycle", "a cycle came late")
+        arm_fault_store(state, "quick").latch("late_cycle", "a cycle came late")
 
     assert "NOT USABLE YET" in said("recover", "ARM", code=3, before=latch)
     assert "quick: acknowledged late_cycle" in said("acknowledge", "ARM", "late_cycle", before=latch)

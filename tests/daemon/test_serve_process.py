@@ -27,7 +27,7 @@ from ident_service.daemon.serve import notify_systemd, watchdog_seconds
 from ident_service.errors import ArmError, MotionRefused, UnknownId, UsageError
 from ident_service.motion.command_channel import ControlFile
 from ident_service.operations.run_archive import import_run
-from ident_service.registry.arms import know_shipped
+from ident_service.registry.arms import register_shipped_arms
 from ident_service.registry.database import Database
 from ident_service.registry.state_folder import control_path
 
@@ -259,7 +259,7 @@ def test_a_unit_of_its_own_does_motions_under_a_lease_and_nothing_else(state: Pa
     looks = folder / "looks"
     looks.mkdir()
     with Database(state) as db:
-        know_shipped(db)
+        register_shipped_arms(db)
         seen = command_of_request(db, state, Watch(kind="watch", arm="planar2", seconds=0.1)).words
     assert motion_unit(looks, {"folder": str(looks), "words": list(seen)})[0] == 0
     answer = json.loads((looks / ANSWER).read_text())

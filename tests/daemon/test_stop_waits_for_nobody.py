@@ -21,7 +21,7 @@ from ident_service.daemon.jobs.requests import Run
 from ident_service.motion.command_channel import ControlFile
 from ident_service.registry import jobs as rows
 from ident_service.registry.database import FILE, audit_log
-from ident_service.registry.state_folder import control_path, fault_file
+from ident_service.registry.state_folder import arm_fault_store, control_path
 
 FAR = "203.0.113.9"
 SOON = 8.0  # s: less than the ten that a write waits for another process
@@ -190,7 +190,7 @@ def test_acts_at_a_terminal_are_entered_under_a_name(
     assert "its line in the audit trail is written later" in capsys.readouterr().err
     assert main(["stop", "--state", str(state)]) == 0  # nobody moves: what was wanted is so
     assert "no arm is moving" in capsys.readouterr().out
-    fault_file(state, "planar2").latch("late_cycle", "a cycle was late")
+    arm_fault_store(state, "planar2").latch("late_cycle", "a cycle was late")
     assert main(["ack", "planar2", "late_cycle", "--by", "ann", "--state", str(state)]) == 0
     assert main(["token", "add", "bob", "--role", "viewer", "--by", "ann", "--state", str(state)]) == 0
     assert main(["token", "revoke", "bob", "--state", str(state)]) == 0

@@ -111,7 +111,7 @@ def test_a_dry_run_of_zeroing_tells_the_counts_that_would_be_kept() -> None:
     assert held == [change.after & 0xFFFF_FFFF for one in found for change in one.changes]
     face = bench.behind.emulator.faces[1]
     face.power.state = PowerState.OPERATION_ENABLED  # type: ignore[attr-defined]
-    face.warn(False, bench.behind.clock.now_ns())  # which tells its state anew
+    face.set_warning(False, bench.behind.clock.now_ns())  # which tells its state anew
     (_, second) = planned_zero(config, bench.links)  # type: ignore[arg-type]
     assert "only changed while it is off" in second.refused
     with pytest.raises(DriverError, match="no home is set"):

@@ -159,8 +159,8 @@ def test_a_drive_that_is_on_or_another_is_not_touched() -> None:
     assert bench.downloads() == []
     bench.behind.settle(bench.behind.clock.now_ns() + 1_000_000_000)  # until it has booted
     face = bench.behind.emulator.faces[0]
-    face.power.control(6)  # type: ignore[attr-defined]
-    face.power.control(7)  # type: ignore[attr-defined]
+    face.power.process_controlword(6)  # type: ignore[attr-defined]
+    face.power.process_controlword(7)  # type: ignore[attr-defined]
     face.tick(bench.behind.clock.now_ns())
     assert bench.states[0] == "switched on"
     for act in (

@@ -20,7 +20,7 @@ from drivers.can.can_link import Link
 from drivers.canopen.capabilities import family_of, shipped_families
 from ident_service.cli import DONE, USAGE, VERDICT_NO, main
 from ident_service.config.arm import ArmConfig
-from ident_service.config.drive_family import family_from
+from ident_service.config.drive_family import parse_family
 from ident_service.config.eds import data_sheet
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.config.quantities import TextFile
@@ -247,7 +247,7 @@ def test_families_are_found_by_vendor_and_product_and_the_users_come_first() -> 
     assert family_of({"vendor": 0x9A, "product": 0x30923}).name == "Elmo Gold"
     assert family_of({"vendor": 0x9A}).name == "Elmo SimplIQ"
     assert family_of({}).name == "generic402"
-    mine = family_from("mine.yaml", "{name: mine, proved: yes, match: {vendor: 0xFB}, sources: {match: my bench}}")
+    mine = parse_family("mine.yaml", "{name: mine, proved: yes, match: {vendor: 0xFB}, sources: {match: my bench}}")
     assert family_of({"vendor": 0xFB, "product": 1}, [mine]).name == "mine"
     assert family_of({"vendor": 0xFB, "product": 1}, [mine]).torque_limit == shipped_families()[-1].torque_limit
 
@@ -325,7 +325,7 @@ def test_makers_without_a_file_at_hand_are_emulated_by_what_their_family_says(na
 )
 def test_a_family_with_a_mistake_is_refused_in_words(text: str, words: str, tmp_path: Path) -> None:
     with pytest.raises(DriverError, match=words):
-        family_from("mine.yaml", text)
+        parse_family("mine.yaml", text)
     (tmp_path / "mine.yaml").write_text(text)
     arm = tmp_path / "arm.yaml"
     wam = shipped_arms()["wam7_canopen"]

@@ -191,7 +191,7 @@ def test_a_step_that_was_prepared_is_the_step_to_the_bit(tmp_path: Path, noise: 
             elif changed == 20 and not noise:  # which acts on no joint that is braked, and is drawn for none then
                 body.motors[1].brake(cycle * MS)
             elif changed == 30:
-                body.plant.load(((0.5 + cycle * 1e-3, (0.0, 0.0, 0.0)),))
+                body.plant.attach_loads(((0.5 + cycle * 1e-3, (0.0, 0.0, 0.0)),))
             body.advance((cycle + 1) * MS)
         taken += foreseen is not None and foreseen[1][0] is prepared.plant.position
         assert (prepared.plant.position == plain.plant.position).all()
@@ -223,16 +223,16 @@ def test_a_late_host_finds_the_arm_moved_on_already(tmp_path: Path) -> None:
     emulator = build_emulator(drives_config(tmp_path))
     emulator.power_up(0)
     body = emulator.body
-    emulator.go_on(100 * MS)
+    emulator.compute_ahead(100 * MS)
     assert (body.overdue_ns, body.now_ns) == (None, 0)  # somebody holds it
     for motor in body.motors:
         motor.drive(0.5, 0)
     body.advance(MS)
     assert not body.supported
     start = body.plant.position
-    emulator.go_on(MS + MS)  # a cycle that is in time needs nothing
+    emulator.compute_ahead(MS + MS)  # a cycle that is in time needs nothing
     assert body.plant.position is start
     assert body.overdue_ns is not None
     assert 2 * MS < body.overdue_ns <= MS + 1.5 * MS
-    emulator.go_on(body.overdue_ns)
+    emulator.compute_ahead(body.overdue_ns)
     assert (body.plant.position != start).any()

@@ -27,7 +27,7 @@ from drivers.canopen.pdo_mapping import Pdo
 from drivers.canopen.sdo import Objects, SdoRefused
 from ident_service.cli import DONE, main
 from ident_service.config.eds import DataSheet, data_sheet
-from ident_service.config.load import sheet_file
+from ident_service.config.load import read_eds_file
 from ident_service.config.quantities import TextFile
 from ident_service.errors import IdentError
 from ident_service.operations.drive_configuration import planned_configuration, planned_text
@@ -116,7 +116,7 @@ def test_a_file_of_any_encoding_is_read(encoding: str, tmp_path: Path) -> None:
     text = (SHEETS / "e35.eds").read_text(encoding="latin-1")
     path = tmp_path / "drive.eds"
     path.write_bytes(text.replace("[1000]", "[1000]\nDenotation=Größe").encode(encoding))
-    assert meaning(data_sheet(sheet_file(str(path)).text)) == meaning(data_sheet(text))
+    assert meaning(data_sheet(read_eds_file(str(path)).text)) == meaning(data_sheet(text))
 
 
 def test_compact_arrays_have_their_elements_and_the_values_of_a_dcf() -> None:

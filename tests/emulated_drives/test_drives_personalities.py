@@ -12,7 +12,7 @@ from drivers.can.can_frame import Frame
 from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.eds import data_sheet
-from ident_service.config.load import with_sheets
+from ident_service.config.load import with_eds_files
 from ident_service.errors import UsageError
 from sim_backend.canopen_device.drive import CanopenDrive
 from sim_backend.canopen_device.objects import Objects
@@ -39,7 +39,7 @@ class Still:
 
 
 def arm_of(folder: Path, *names: str, **driver: object) -> ArmConfig:
-    return with_sheets(drives_config(folder, **driver), [str(SHEETS / name) for name in names])
+    return with_eds_files(drives_config(folder, **driver), [str(SHEETS / name) for name in names])
 
 
 def host_of(config: ArmConfig) -> Host:
@@ -152,16 +152,16 @@ def test_pdos_that_the_file_has_off_are_born_off(tmp_path: Path) -> None:
     assert "$NODEID+0x200" in text
     sheet.write_text(text.replace("$NODEID+0x200", "$NODEID+0x80000200"), encoding="latin-1")
     for file, on in ((SHEETS / E35, True), (sheet, False)):
-        drive = LockStepArm(with_sheets(drives_config(tmp_path), [str(file)])).emulator.faces[0]
+        drive = LockStepArm(with_eds_files(drives_config(tmp_path), [str(file)])).emulator.faces[0]
         assert drive.listens(0x201) is on
 
 
 def test_files_are_for_drives_of_canopen_and_must_be_there(tmp_path: Path) -> None:
     config = drives_config(tmp_path)
     with pytest.raises(UsageError, match="no such file"):
-        with_sheets(config, ["none.eds"])
+        with_eds_files(config, ["none.eds"])
     with pytest.raises(UsageError, match="not CANopen's"):
-        with_sheets(config.model_copy(update={"driver": None}), [str(FILES[0])])
+        with_eds_files(config.model_copy(update={"driver": None}), [str(FILES[0])])
 
 
 def test_drives_are_emulated_by_the_files_that_the_description_names(tmp_path: Path) -> None:
@@ -174,5 +174,5 @@ def test_drives_are_emulated_by_the_files_that_the_description_names(tmp_path: P
     assert [host.read(node, 0x1018, 1, "I") for node in (1, 2)] == [0xFB, 0xFF]
     assert [host.read(node, 0x1018, 4, "I") for node in (1, 2)] == [0, 77]
     assert host.write(1, 0x6072, 0, "H", 1) == ABSENT  # what the shipped drive has, and this one has not
-    other = host_of(with_sheets(config, [str(SHEETS / E35)]))
+    other = host_of(with_eds_files(config, [str(SHEETS / E35)]))
     assert [other.read(node, 0x1018, 1, "I") for node in (1, 2)] == [0xFF, 0xFF]

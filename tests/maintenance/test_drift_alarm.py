@@ -14,7 +14,7 @@ from ident_service.cli import main
 from ident_service.operations.drift_alarms import alarms
 from ident_service.operations.maintenance_schedule import DueRule, add_schedule, pending
 from ident_service.registry.database import Database, audit_log
-from ident_service.registry.state_folder import fault_file
+from ident_service.registry.state_folder import arm_fault_store
 from ident_service.results.manifest import verified_files
 
 DRIER = 1.3
@@ -69,7 +69,7 @@ def test_a_drier_joint_raises_an_alarm_that_stands_until_a_person_acts(
     assert alarms(db) == []
     assert alarms(db, closed=True)[0]["closed_by"] == "terminal:ann"
     assert reidentified(state, 23, DRIER, lambda: capsys.readouterr().out).code == 0
-    told = [line["what"] for line in audit_log(db, most=500)]
+    told = [line["what"] for line in audit_log(db, max_lines=500)]
     assert told.count("drift alarm") == 2
     assert told.count("alarm acknowledged") == 1
 
@@ -84,7 +84,7 @@ def test_without_a_typed_name_or_something_accepted_nothing_moves(
     arm = next(state.glob("descriptions/quick-*/arm.yaml"))
     assert main([*words, str(arm), "--confirm", "quack"]) == 2  # 3 would mean that it has changed
     assert "the arm is quick; nothing has moved" in json.loads(capsys.readouterr().out)["error"]["message"]
-    fault_file(state, "quick").latch("lease_lost", "nobody was there")
+    arm_fault_store(state, "quick").latch("lease_lost", "nobody was there")
     assert main([*words, str(arm), "--confirm", "quick"]) == 5
     assert [path.name for path in (state / "runs").iterdir()] == [accepted]
     assert db.rows("SELECT * FROM reidentifications") == []

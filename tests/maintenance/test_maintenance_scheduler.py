@@ -31,7 +31,7 @@ from ident_service.operations.maintenance_schedule import (
 from ident_service.registry import jobs
 from ident_service.registry.arms import add_arm
 from ident_service.registry.database import Database, Row, audit_log
-from ident_service.registry.state_folder import fault_file
+from ident_service.registry.state_folder import arm_fault_store
 
 HOUR = 3600.0
 pytestmark = pytest.mark.slow  # one commissioning for all of them
@@ -66,7 +66,7 @@ class Scene:
         job = self.only["job"]
         if answer is not None:
             (self.state / JOBS / job / "answer.json").write_text(json.dumps(answer))
-        jobs.ended(self.db, job, state, detail)
+        jobs.mark_ended(self.db, job, state, detail)
         self.engine.live._jobs.pop(job)
         self.scheduler.do_pass()
 
@@ -78,7 +78,7 @@ class Scene:
     @property
     def queued(self) -> list[tuple[str, bool]]:
         """Kind, and whether its lease is the service's own."""
-        rows = {row["id"]: row["kind"] for row in jobs.queue(self.db)}
+        rows = {row["id"]: row["kind"] for row in jobs.queued_jobs(self.db)}
         return [(rows[live.job], live.own_lease) for live in self.engine.live.entered() if live.job in rows]
 
     @property
@@ -144,7 +144,7 @@ def test_a_run_that_was_refused_is_not_named(scene: Scene) -> None:
 
 
 def _faulted(scene: Scene) -> str:
-    fault_file(scene.state, ARM).latch("late_cycle", "a cycle was late")
+    arm_fault_store(scene.state, ARM).latch("late_cycle", "a cycle was late")
     return "a fault waits"
 
 
@@ -181,11 +181,11 @@ def test_what_stands_against_it_asks_for_a_person_for_good(scene: Scene, spoil: 
     assert scene.why
     assert all(words in why for why in scene.why)
     # Neither an acknowledged fault nor a free arm sets off what was refused before.
-    for file in (fault_file(scene.state, ARM),):
+    for file in (arm_fault_store(scene.state, ARM),):
         for code in file.latched():
             file.acknowledge(code)
-    for row in jobs.queue(scene.db):
-        jobs.ended(scene.db, row["id"], "cancelled", "")
+    for row in jobs.queued_jobs(scene.db):
+        jobs.mark_ended(scene.db, row["id"], "cancelled", "")
     scene.clock.forward(1.0)
     scene.scheduler.do_pass()
     assert reidentifications(scene.db) == []
@@ -194,7 +194,7 @@ def test_what_stands_against_it_asks_for_a_person_for_good(scene: Scene, spoil: 
 def test_a_stop_between_the_steps_is_a_stop(scene: Scene) -> None:
     scene.scheduler.reidentifications.begin(ReidentificationRequest(ARM), "ann")
     job = scene.only["job"]
-    jobs.ended(scene.db, job, "done", "")
+    jobs.mark_ended(scene.db, job, "done", "")
     scene.engine.live._jobs.pop(job)
     assert scene.engine.stop(ARM, "bob") == {"arms": [], "jobs": []}  # nothing moves at this moment
     scene.scheduler.do_pass()
@@ -214,7 +214,7 @@ def test_one_at_a_time(scene: Scene) -> None:
 
 def test_a_restart_after_the_preflight_does_not_begin_the_run(scene: Scene) -> None:
     scene.scheduler.reidentifications.begin(ReidentificationRequest(ARM), "ann")
-    jobs.ended(scene.db, scene.only["job"], "done", "")
+    jobs.mark_ended(scene.db, scene.only["job"], "done", "")
     scene.restart()
     scene.scheduler.do_pass()
     assert (scene.only["state"], scene.queued) == ("interrupted", [])
@@ -225,7 +225,7 @@ def test_a_restart_after_the_preflight_does_not_begin_the_run(scene: Scene) -> N
 def test_a_restart_during_a_motion_is_reported_when_it_is_known(scene: Scene, running: bool) -> None:
     scene.scheduler.reidentifications.begin(ReidentificationRequest(ARM), "ann")
     if running:
-        jobs.started(scene.db, scene.only["job"], "")
+        jobs.mark_started(scene.db, scene.only["job"], "")
     scene.restart()
     scene.scheduler.do_pass()
     if running:  # its process is being looked for
@@ -241,7 +241,7 @@ def test_a_restart_during_a_motion_is_reported_when_it_is_known(scene: Scene, ru
 def test_a_restart_before_what_only_computes_goes_on(scene: Scene, accepted: str) -> None:
     scene.scheduler.reidentifications.begin(ReidentificationRequest(ARM), "ann")
     scene.ended()
-    jobs.ended(scene.db, scene.only["job"], "done", "")
+    jobs.mark_ended(scene.db, scene.only["job"], "done", "")
     # The run that a process would have left: the accepted one's recording.
     folder = scene.state / "runs" / accepted
     (folder / "identification.mcap").rename(folder / "run.mcap")
@@ -254,11 +254,11 @@ def test_a_restart_before_what_only_computes_goes_on(scene: Scene, accepted: str
     scene.restart()
     scene.scheduler.do_pass()
     assert (scene.only["state"], scene.only["step"], scene.queued) == ("running", "identify", [("identify", False)])
-    (row,) = jobs.queue(scene.db)
+    (row,) = jobs.queued_jobs(scene.db)
     # By the description that was accepted, and not by today's.
     assert row["words"][row["words"].index("--arm") + 1].endswith("accepted/0001/arm.json")
     # And a kill of what computes leaves a word of where the recording is.
-    jobs.started(scene.db, row["id"], "")
+    jobs.mark_started(scene.db, row["id"], "")
     scene.restart()
     explain_interrupted(scene.db, scene.state)
     scene.scheduler.do_pass()

@@ -18,7 +18,7 @@ from ident_service.cli import main
 from ident_service.client import IdentClient
 from ident_service.errors import IdentError
 from ident_service.registry.database import Database
-from ident_service.registry.state_folder import fault_file
+from ident_service.registry.state_folder import arm_fault_store
 from ident_service.registry.tokens import add_token
 
 pytestmark = pytest.mark.slow
@@ -161,7 +161,7 @@ def test_a_person_asks_by_the_command_and_a_drier_joint_is_found(
         assert ident("alarm", "list")[:2] == (0, "no open alarms\n")
         assert ident("alarm", "ack", "1", "--note", "x")[0] == 2
         # An arm that a person must look at first is not told as one that has changed, which is exit code 3.
-        fault_file(state, ARM).latch("lease_lost", "nobody was there")
+        arm_fault_store(state, ARM).latch("lease_lost", "nobody was there")
         code, out, err = ident("reidentify", ARM, "--confirm", ARM)
         assert (code, "lease_lost" in out + err) == (5, True)
 

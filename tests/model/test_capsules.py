@@ -12,7 +12,7 @@ from ident_service.config.arm import ArmConfig
 from ident_service.config.motion_design import Workspace
 from ident_service.errors import ModelError, MotionRefused
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.capsule_distances import CapsuleModel, between_segments, to_boxes
+from ident_service.model.capsule_distances import CapsuleModel, distances_between_segments, distances_to_boxes
 from ident_service.model.collision import CollisionModel
 
 SHAPES = (
@@ -152,7 +152,7 @@ def test_no_two_points_of_segments_are_nearer(
     other_along = (other_along, along, -2.0 * along, 1e-9 * other_along)[turn]
     column = [vector[:, None, None] for vector in (start, along, other_start, other_along)]
     squares = [np.array([[float(vector @ vector)]]) for vector in (along, other_along)]
-    distance, direction, s, t = between_segments(*column, *squares)
+    distance, direction, s, t = distances_between_segments(*column, *squares)
     share = np.linspace(0.0, 1.0, 101)
     points, others = start + share[:, None] * along, other_start + share[:, None] * other_along
     assert distance[0, 0] <= np.linalg.norm(points[:, None] - others[None], axis=2).min() + 1e-7
@@ -164,7 +164,7 @@ def test_no_two_points_of_segments_are_nearer(
 def test_no_point_of_a_segment_is_nearer_to_the_box(start: np.ndarray, along: np.ndarray, half: np.ndarray) -> None:
     half = np.abs(half) + 0.01
     column = [vector[:, None, None] for vector in (start, along, half)]
-    distance, _, _ = to_boxes(*column)
+    distance, _, _ = distances_to_boxes(*column)
     beyond = np.abs(start + np.linspace(0.0, 1.0, 1001)[:, None] * along) - half
     signed = np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0)
     assert signed.min() - 0.0011 <= distance[0, 0] <= signed.min() + 1e-9

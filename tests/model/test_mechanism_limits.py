@@ -128,9 +128,9 @@ def test_a_process_ends_at_its_limits(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, work: str, deadline: float, message: str | None
 ) -> None:
     (tmp_path / "limited_work.py").write_text(
-        "from ident_service.model.limited_process import answer_within\n"
+        "from ident_service.model.limited_process import print_json_within_limits\n"
         f"def work():\n    {work}\n    return {{'done': True}}\n"
-        "answer_within(2**29, 1, work)\n"
+        "print_json_within_limits(2**29, 1, work)\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
     if message is None:

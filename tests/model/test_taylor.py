@@ -78,7 +78,7 @@ def test_a_straight_line_is_enclosed_exactly() -> None:
     line = TaylorModel(np.array([1.0]), np.array([2.0]), np.zeros(1), h)
     both = (line + line - line.scaled(0.5)).shifted(3.0)
     assert (both.c, both.d, both.r) == (4.5, 3.0, 0.0)
-    assert both.reach == 1.5
+    assert both.deviation_bound == 1.5
 
 
 def test_at_a_peak_the_excess_is_of_second_order() -> None:

@@ -199,7 +199,7 @@ def test_a_run_over_a_drive_that_is_error_passive_stops_under_control(when: str)
     if when == "before it was opened":
         face = behind.emulator.faces[1]
         assert isinstance(face, CanopenDrive)
-        face.emergency.occurs(0x8120)
+        face.emergency.add_error(0x8120)
     with CanopenArm(described, lambda _: taps) as arm:
         if when == "while it was idle":
             taps[0].disturb([drive_says(0x8120, 0x11)], drives_hear=False)

@@ -20,7 +20,7 @@ from ident_service.operations.maintenance_schedule import events, pending, sched
 from ident_service.operations.parameter_files import compare_into
 from ident_service.registry import jobs as rows
 from ident_service.registry.database import audit_log
-from ident_service.registry.state_folder import fault_file
+from ident_service.registry.state_folder import arm_fault_store
 
 
 def sent(daemon: Asked, address: str, **fields: str) -> tuple[int, str]:
@@ -137,7 +137,7 @@ def test_the_workflow_says_re_identify_when_something_asks_for_it(daemon: Asked)
 def test_a_re_identification_needs_the_typed_name_and_a_fresh_page(daemon: Asked) -> None:
     enter(daemon, "operator")
     db = daemon.service.db
-    fault_file(daemon.service.state, ARM).acknowledge("FOLLOWING_ERROR")
+    arm_fault_store(daemon.service.state, ARM).acknowledge("FOLLOWING_ERROR")
     before = len(reidentifications(db))
 
     def challenge() -> str:

@@ -10,7 +10,7 @@ from playwright.sync_api import Browser, expect
 
 from ident_service.daemon.jobs.requests import Base
 from ident_service.registry.arms import add_arm
-from ident_service.registry.state_folder import fault_file
+from ident_service.registry.state_folder import arm_fault_store
 
 pytestmark = pytest.mark.slow
 
@@ -21,13 +21,13 @@ def test_lists_follow_what_happens(browser: Browser, reached: Reached, place: Pa
     loads = list[str]()
     page.on("load", lambda _: loads.append(page.url))
     main = page.locator("#main")
-    fault_file(place, "planar2").latch("overspeed", "too fast")
+    arm_fault_store(place, "planar2").latch("overspeed", "too fast")
     expect(main).to_contain_text("1 fault")
     add_arm(reached.service.db, place, "extends: planar2\nname: bench\n", {}, "test")
     expect(main.get_by_role("link", name="bench", exact=True)).to_be_visible(timeout=30_000)
     # Whoever stands on a link there keeps it; what is missed comes when they leave.
     main.get_by_role("link", name="bench", exact=True).focus()
-    fault_file(place, "planar2").acknowledge("overspeed")
+    arm_fault_store(place, "planar2").acknowledge("overspeed")
     page.wait_for_timeout(2000)
     expect(main.get_by_role("link", name="bench", exact=True)).to_be_focused()
     expect(main).to_contain_text("1 fault")

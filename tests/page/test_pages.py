@@ -31,7 +31,7 @@ from ident_service.operations.run_archive import import_run
 from ident_service.recordings.open import open_recording
 from ident_service.registry import jobs as rows
 from ident_service.registry.runs import label_run
-from ident_service.registry.state_folder import arm_folder, fault_file
+from ident_service.registry.state_folder import arm_fault_store, arm_folder
 from ident_service.registry.tokens import add_token
 from ident_service.results.manifest import write_manifest
 
@@ -52,10 +52,10 @@ def daemon(state: Path, commissioned: Path) -> Iterator[Asked]:
         answer = asked.post(f"/api/v1/arms/{ARM}/acceptances", {"run": commissioned.name, "note": EVIL})
         assert answer.status_code == 201, answer.text
         arm_folder(state, ARM).mkdir(parents=True, exist_ok=True)
-        fault_file(state, ARM).latch("FOLLOWING_ERROR", EVIL)
+        arm_fault_store(state, ARM).latch("FOLLOWING_ERROR", EVIL)
         label_run(db, commissioned.name, ["belt"], EVIL, EVIL)
-        rows.add_job(db, "j1", "run", ARM, {"kind": "run"}, [], "test", motion=True, run="none")
-        rows.ended(db, "j1", "failed", EVIL)
+        rows.add_job(db, "j1", "run", ARM, {"kind": "run"}, [], "test", motion=True, run_id="none")
+        rows.mark_ended(db, "j1", "failed", EVIL)
         (state / "jobs" / "j1").mkdir(parents=True)
         (state / "jobs" / "j1" / "log").write_text(EVIL)
         now = time.time()
@@ -211,7 +211,7 @@ def test_a_viewer_may_do_nothing_with_forms(daemon: Asked, commissioned: Path) -
     db = daemon.service.db
     assert (len(schedules(db)), len(pending(db)), len(alarms(db)), len(events(db, ARM))) == (3, 1, 1, 1)
     assert daemon.get("/new").status_code == 403
-    assert list(fault_file(daemon.service.state, ARM).latched()) == ["FOLLOWING_ERROR"]
+    assert list(arm_fault_store(daemon.service.state, ARM).latched()) == ["FOLLOWING_ERROR"]
 
 
 @pytest.mark.parametrize(
@@ -224,15 +224,15 @@ def test_a_form_of_another_page_does_nothing(daemon: Asked, headers: dict[str, s
     sent = {"Content-Type": FORM["Content-Type"], **headers}
     answer = daemon.post(f"/arms/{ARM}/ack", content="code=FOLLOWING_ERROR", headers=sent)
     assert answer.status_code == 403
-    assert list(fault_file(daemon.service.state, ARM).latched()) == ["FOLLOWING_ERROR"]
+    assert list(arm_fault_store(daemon.service.state, ARM).latched()) == ["FOLLOWING_ERROR"]
     answer = daemon.post(f"/arms/{ARM}/ack", content="code=FOLLOWING_ERROR", headers=FORM)
     assert answer.status_code == 303
-    assert not fault_file(daemon.service.state, ARM).latched()
+    assert not arm_fault_store(daemon.service.state, ARM).latched()
 
 
 def test_a_motion_needs_the_typed_name_and_a_fresh_page(daemon: Asked) -> None:
     enter(daemon, "operator")
-    fault_file(daemon.service.state, ARM).acknowledge("FOLLOWING_ERROR")
+    arm_fault_store(daemon.service.state, ARM).acknowledge("FOLLOWING_ERROR")
 
     def challenge() -> str:
         answer = daemon.post(f"/arms/{ARM}/confirm", content="kind=check", headers=FORM)
@@ -272,7 +272,7 @@ def test_the_page_of_a_job_shows_what_a_terminal_would(daemon: Asked) -> None:
 
 def test_a_run_is_requested_with_a_target(daemon: Asked) -> None:
     enter(daemon, "operator")
-    fault_file(daemon.service.state, ARM).acknowledge("FOLLOWING_ERROR")
+    arm_fault_store(daemon.service.state, ARM).acknowledge("FOLLOWING_ERROR")
     fields = [attrs for _, attrs in Reader(daemon.get(f"/arms/{ARM}").text).tags if attrs.get("name") == "until"]
     assert [one["type"] for one in fields] == ["number"]
 
@@ -412,7 +412,7 @@ def test_an_arm_with_recordings_only_begins_at_identify(daemon: Asked) -> None:
 
 def test_a_motion_is_confirmed_knowing_its_length_speed_and_reach(daemon: Asked) -> None:
     enter(daemon, "operator")
-    fault_file(daemon.service.state, ARM).acknowledge("FOLLOWING_ERROR")
+    arm_fault_store(daemon.service.state, ARM).acknowledge("FOLLOWING_ERROR")
 
     def shown(kind: str, speed: float) -> str:
         answer = daemon.post(f"/arms/{ARM}/confirm", content=f"kind={kind}&speed={speed}", headers=FORM)

@@ -225,7 +225,7 @@ def test_meshes_cover_the_capsules_that_distances_are_of(
         (tmp_path / name).write_bytes(content)
     add_arm(
         *(reached.service.db, reached.service.state, text, {"threelink.urdf": urdf}, "test"),
-        draw=lambda path, out: _drawn_document(path, tmp_path, out),
+        make_meshes=lambda path, out: _drawn_document(path, tmp_path, out),
     )
     confirm_page(page, reached, arm="crane")
     box = page.get_by_label("Show what distances are of")

@@ -110,7 +110,7 @@ def test_a_joint_with_more_friction_than_expected_is_told_before_a_run_takes_it_
     shipped = load_arm("threelink")
     design = shipped.design.model_copy(update={"friction_guess": (guess, 0.05)})
     config = shipped.model_copy(update={"design": design})
-    ticket = preflight(make_arm(config), arm_model(config), None, confirm=lambda _: config.name, look_seconds=0.2)
+    ticket = preflight(make_arm(config), arm_model(config), None, confirm=lambda _: config.name, idle_seconds=0.2)
     check = check_of(ticket, "direction")
     assert check.verdict is Verdict.PASSED
     assert check.reason.startswith("slide: friction takes 2 N m or N, more than is expected") == told

@@ -24,7 +24,7 @@ from ident_service.config.load import load_arm, shipped_arms
 from ident_service.errors import DriverError, RecordingError
 from ident_service.recordings.mcap_reader import McapRecording
 from ident_service.recordings.open import open_recording
-from ident_service.registry.state_folder import fault_file
+from ident_service.registry.state_folder import arm_fault_store
 from sim_backend.plant_status import PlantStatus, read_status
 
 PATIENCE = 90.0  # s of the machine's time; nothing is judged by it but what never happens
@@ -122,7 +122,7 @@ class Lane:
         )
         self.config = load_arm(self.arm)
         self._real = "time: real" in driver
-        self.faults = fault_file(self.state, self.config.name)
+        self.faults = arm_fault_store(self.state, self.config.name)
 
     def check(self) -> None:
         """Preflight, unless the last one still counts."""

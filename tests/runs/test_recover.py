@@ -20,7 +20,7 @@ from ident_service.errors import ActionNeeded, DriverError
 from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.command_channel import ControlFile
 from ident_service.operations.recovery import Recovery, _support, recover
-from ident_service.registry.state_folder import control_path, fault_file
+from ident_service.registry.state_folder import arm_fault_store, control_path
 from sim_backend.arm import from_config
 from sim_backend.faults import Fault, FaultKind
 
@@ -105,7 +105,7 @@ def test_a_healthy_arm_at_home_only_needs_a_check(tmp_path: Path, state: Path) -
 
 def test_drives_are_reset_only_after_every_fault_is_acknowledged(tmp_path: Path, state: Path) -> None:
     config = config_with(tmp_path, more=LEVEL)
-    arm, faults = broken(config), fault_file(state, config.name)
+    arm, faults = broken(config), arm_fault_store(state, config.name)
     faults.latch("drive_fault", "elbow: the drive reports a fault")
     faults.latch("lease_lost", "the lease was not renewed in time")
     found = recover(config, state, arm)
@@ -207,7 +207,7 @@ def test_an_arm_that_does_not_answer_is_reported(tmp_path: Path, state: Path) ->
 
 
 def test_a_fault_keeps_its_first_cause_and_time(state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    faults = fault_file(state, "arm")
+    faults = arm_fault_store(state, "arm")
     for now, code, cause in ((1000.0, "one", "first"), (2000.0, "two", "second"), (3000.0, "one", "again")):
         monkeypatch.setattr("time.time", lambda now=now: now)
         faults.latch(code, cause)
@@ -256,7 +256,7 @@ def test_home_keeps_the_rules_of_a_run(ident: Callable[..., tuple[int, str]], tm
     code, said = ident("recover", "--leave-limit", "--out", str(tmp_path / "inside"))
     assert code == 3
     assert "nothing to leave" in said
-    fault_file(state, "planar2").latch("following_error", "something pushed")
+    arm_fault_store(state, "planar2").latch("following_error", "something pushed")
     code, said = ident("home", "--out", str(tmp_path / "again"))
     assert code == 3
     assert "following_error (something pushed)" in said

@@ -16,7 +16,7 @@ from ident_service.config.load import load_arm, shipped_arms
 from ident_service.errors import UsageError
 from ident_service.motion.arm_factory import make_arm
 from ident_service.operations.recovery import recover, release_held_drives
-from ident_service.registry.state_folder import fault_file
+from ident_service.registry.state_folder import arm_fault_store
 from sim_backend.emulator.faults import DriveFault
 from sim_backend.emulator.lock_step import LockStepArm, hold_emulated_arm
 
@@ -81,7 +81,7 @@ def test_a_latched_drive_fault_is_reset_when_it_is_acknowledged(
 ) -> None:
     session(config, behind, DriveFault("emergency", 1, size=0x4310))
     assert "fault, error 0x4310" in states(behind)[1]
-    faults = fault_file(state, config.name)
+    faults = arm_fault_store(state, config.name)
     faults.latch("drive_fault", "elbow: the drive reports a fault")
     found = recover(config, state)
     assert not found.usable

@@ -25,7 +25,7 @@ from ident_service.errors import ArmError, ArmFault, MotionRefused
 from ident_service.motion.command_channel import ControlFile, is_control_file_in_use
 from ident_service.motion.control_loop import LOWERS, WAITS
 from ident_service.operations.motion_run import ProcessResult
-from ident_service.registry.state_folder import control_path, fault_file, ticket_path
+from ident_service.registry.state_folder import arm_fault_store, control_path, ticket_path
 
 Capture = pytest.CaptureFixture[str]
 
@@ -79,7 +79,7 @@ def test_a_full_disk_is_the_fault_that_it_is(
     capsys.readouterr()
     assert main([*words, *(["--json"] if form == "json" else [])]) == 4
     out, err = capsys.readouterr()
-    ((code, cause),) = fault_file(tmp_path / "state", "planar2").latched().items()
+    ((code, cause),) = arm_fault_store(tmp_path / "state", "planar2").latched().items()
     assert code == "recorder_behind"
     assert "File too large" in cause
     lines = [line for line in err.splitlines() if not line.startswith("next: ")]
@@ -102,7 +102,7 @@ FILLED = """
 import json, os, sys
 from pathlib import Path
 from ident_service.cli import main, motion_commands
-from ident_service.registry.state_folder import fault_file
+from ident_service.registry.state_folder import arm_fault_store
 arm, disk = sys.argv[1], Path(sys.argv[2])
 
 def fill(_, line):
@@ -119,7 +119,7 @@ def filled(answer, line):
 
 motion_commands.tell = filled
 code = main(["run", arm, "--out", str(disk / "run"), "--state", str(disk / "state")])
-faults = fault_file(disk / "state", "planar2")
+faults = arm_fault_store(disk / "state", "planar2")
 latched = faults.latched()
 stored = (disk / "state/arms/planar2/faults.json").exists()
 (disk / "other").unlink()
@@ -161,7 +161,7 @@ def test_a_second_ctrl_c_waits_for_the_stop_and_tells_the_truth(
     assert err == ""
     ended = json.loads((tmp_path / "run" / "ended.json").read_text())
     assert (ended["state"], ended["lateness"], ended["compute"]) == ("stopped", None, None)
-    assert fault_file(tmp_path / "state", "planar2").latched() == {}
+    assert arm_fault_store(tmp_path / "state", "planar2").latched() == {}
 
 
 @pytest.mark.slow
@@ -174,7 +174,7 @@ def test_a_terminal_that_closes_stops_the_arm_under_control(
     when(monkeypatch, {"exciting": hang_up, "stopping": hang_up})
     assert main(words) == 1
     assert json.loads((tmp_path / "run" / "ended.json").read_text())["state"] == "stopped"
-    assert fault_file(tmp_path / "state", "planar2").latched() == {}
+    assert arm_fault_store(tmp_path / "state", "planar2").latched() == {}
 
 
 @pytest.mark.slow
@@ -256,7 +256,7 @@ def test_a_state_that_cannot_be_written_is_found_before_anything_moves(
 
 
 def test_the_first_fault_is_the_error_and_the_others_are_its_notes(tmp_path: Path) -> None:
-    faults = fault_file(tmp_path, "planar2")
+    faults = arm_fault_store(tmp_path, "planar2")
     for code, cause in (("drive_fault", "a cable"), ("following_error", "elbow"), ("bus_silent", "nothing")):
         faults.latch(code, cause)
     ending = ProcessResult({}, {"kind": "ArmFault", "code": "bus_silent", "message": "bus_silent: nothing"}, 4)
@@ -271,11 +271,11 @@ def test_a_fault_that_could_not_be_latched_is_still_the_error(tmp_path: Path) ->
         {}, {"kind": "ArmFault", "code": "runaway", "message": "runaway: a sign; it could not be latched"}
     )
     with pytest.raises(ArmFault, match=r"^runaway: a sign; it could not be latched$"):
-        ending.raise_for(fault_file(tmp_path, "planar2"))
+        ending.raise_for(arm_fault_store(tmp_path, "planar2"))
 
 
 def test_a_refusal_stays_one_and_a_death_without_a_word_is_none(tmp_path: Path) -> None:
-    faults = fault_file(tmp_path, "planar2")
+    faults = arm_fault_store(tmp_path, "planar2")
     with pytest.raises(MotionRefused, match=r"^not at rest$"):
         ProcessResult({}, {"kind": "MotionRefused", "message": "not at rest"}).raise_for(faults)
     with pytest.raises(ArmError, match=r"without a message \(SIGKILL\) before it opened the arm"):
@@ -307,7 +307,7 @@ def test_an_arm_without_brakes_is_held_until_a_person_confirms(
     assert main(loose) == 1
     assert said[-3:] == ["stopped", WAITS, LOWERS]
     assert "planar2: support confirmed\n" in capsys.readouterr().out
-    assert fault_file(tmp_path / "state", "planar2").latched() == {}
+    assert arm_fault_store(tmp_path / "state", "planar2").latched() == {}
 
 
 @pytest.mark.slow
@@ -325,4 +325,4 @@ def test_a_held_arm_does_not_fall_with_whoever_requested_the_motion(loose: list[
         assert is_control_file_in_use(control)
         controls.confirm_support()
     wait_for(lambda: not is_control_file_in_use(control), "it is not let go")
-    assert list(fault_file(tmp_path / "state", "planar2").latched()) == ["lease_lost"]
+    assert list(arm_fault_store(tmp_path / "state", "planar2").latched()) == ["lease_lost"]

@@ -28,7 +28,7 @@ from ident_service.motion.ticket import read_ticket
 from ident_service.operations.motion_run import run_motion
 from ident_service.recordings.mcap_reader import McapRecording
 from ident_service.recordings.open import open_recording
-from ident_service.registry.state_folder import fault_file, ticket_path
+from ident_service.registry.state_folder import arm_fault_store, ticket_path
 
 Command = "subprocess.Popen[str]"
 
@@ -133,14 +133,14 @@ def test_a_stop_while_a_run_is_being_prepared_keeps_it_from_beginning(virtual_ar
     with pytest.raises(MotionRefused, match="a stop was requested before the arm was energised"):
         run_motion(config, motion, tmp_path / "run", state, ticket, requested_ns=requested_ns)
     assert not (tmp_path / "run").exists()
-    assert not fault_file(state, config.name).latched()
+    assert not arm_fault_store(state, config.name).latched()
     assert run_motion(config, motion, tmp_path / "run", state, ticket).report["state"] == "done"
 
 
 @pytest.mark.campaign
 def test_a_parent_that_hangs_loses_its_lease(started: Started, tmp_path: Path) -> None:
     started.reaches("exciting")
-    faults = fault_file(tmp_path / "state", "planar2")
+    faults = arm_fault_store(tmp_path / "state", "planar2")
     started.process.send_signal(signal.SIGSTOP)
     try:
         wait_for(lambda: "lease_lost" in faults.latched())

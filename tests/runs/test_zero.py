@@ -22,7 +22,7 @@ from ident_service.motion.command_channel import ControlFile
 from ident_service.motion.ticket import Ticket, Verdict, subject_of
 from ident_service.operations.recovery import home_posture, recover, set_home
 from ident_service.preflight.preflight import preflight
-from ident_service.registry.state_folder import control_path, fault_file, ticket_path
+from ident_service.registry.state_folder import arm_fault_store, control_path, ticket_path
 from sim_backend.emulator.faults import DriveFault
 from sim_backend.emulator.lock_step import LockStepArm, hold_emulated_arm
 
@@ -166,7 +166,7 @@ def test_nothing_changes_when_nobody_says_so(config: ArmConfig, behind: LockStep
 
 def test_latched_faults_are_stated(config: ArmConfig, behind: LockStepArm, state: Path) -> None:
     set_home(config, state, sure)
-    fault_file(state, config.name).latch("drive_restarted", "node 2: has booted")
+    arm_fault_store(state, config.name).latch("drive_restarted", "node 2: has booted")
     behind.inject(DriveFault("reboot", 1))
     behind.settle(behind.clock.now_ns() + 100_000_000)
     found = recover(config, state)
@@ -179,7 +179,7 @@ def test_latched_faults_are_stated(config: ArmConfig, behind: LockStepArm, state
     done = set_home(config, state, sure)
     assert [fault.code for fault in done.faults] == ["drive_restarted"]
     assert not recover(config, state).usable
-    fault_file(state, config.name).acknowledge("drive_restarted")
+    arm_fault_store(state, config.name).acknowledge("drive_restarted")
     assert recover(config, state).usable
 
 

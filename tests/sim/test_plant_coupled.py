@@ -93,7 +93,7 @@ def test_all_joints_stand_exactly_where_all_drives_stick() -> None:
 def test_braking_of_coupled_drives_is_theirs() -> None:
     """Braking by a matrix that couples joints acts as viscous friction of the drives does."""
     one, other = coupled(7, fv=0.3), coupled(7)
-    other.brake(COUPLING.T @ np.diag(np.full(4, 0.3)) @ COUPLING)
+    other.set_braking(COUPLING.T @ np.diag(np.full(4, 0.3)) @ COUPLING)
     torque = np.array([0.4, 12.0, -0.3, 0.2])
     for _ in range(200):
         one.step(torque)

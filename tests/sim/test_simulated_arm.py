@@ -206,7 +206,7 @@ def test_pieces_that_do_not_fit_are_refused():
 
 def test_a_clip_that_is_no_whole_step_rounds_inwards():
     drives = Imperfections(np.zeros(2), np.array([0.3, 0.0]), np.zeros(2), np.array([1.0, 1.0]))
-    np.testing.assert_allclose(drives.drive(np.array([5.0, -5.0])), [0.9, -1.0])
+    np.testing.assert_allclose(drives.quantize_torque(np.array([5.0, -5.0])), [0.9, -1.0])
 
 
 @pytest.mark.parametrize("time", ["virtual", "real"])

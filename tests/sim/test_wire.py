@@ -52,7 +52,7 @@ def test_replies_come_out_as_they_went_in(frame):
 
 @pytest.mark.parametrize("text", ["no", "a joint called \N{GREEK SMALL LETTER ALPHA}", "x" * 1000])
 def test_errors_arrive_as_text(text):
-    _, found = decode_reply(encode(wire.failed(ValueError(text)), 1, N), N)
+    _, found = decode_reply(encode(wire.failure_of(ValueError(text)), 1, N), N)
     assert isinstance(found, wire.Failed)
     assert wire.text_of(found) == text[:480]
 

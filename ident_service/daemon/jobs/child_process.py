@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Final, Protocol
 
 from ident_service.errors import UsageError
-from ident_service.model.limited_process import ENDS_WITH_INPUT, own_module
+from ident_service.model.limited_process import ENDS_WITH_INPUT, module_command
 
 ANSWER, LOG, PROCESS = "answer.json", "log", "process"
 RENEW: Final = b"\n"
@@ -56,7 +56,7 @@ class SubprocessJob:
 
     def __init__(self, words: tuple[str, ...], folder: Path, *, computes: bool = False) -> None:
         """Start `ident WORDS` with its files in `folder`; one that `computes` ends with this process."""
-        command, environment = own_module("ident_service", *words)
+        command, environment = module_command("ident_service", *words)
         environment |= {ENDS_WITH_INPUT: "1"} if computes else {}
         environment.pop("NOTIFY_SOCKET", None)  # the service manager watches the service, not this process
         with (folder / ANSWER).open("xb") as answer, (folder / LOG).open("xb") as log:

@@ -239,7 +239,7 @@ def forget_unmade(db: Database, state: Path, row: Row) -> None:
     """Clear the folder's id in an ended job's row if the folder was never made: after a refusal, for example."""
     folder = folder_of(state, row)
     if folder is not None and not folder.exists():
-        rows.made_nothing(db, row["id"])
+        rows.clear_folder_id(db, row["id"])
 
 
 END_UNOBSERVED: Final = "the service died while it ran, and its process"
@@ -264,7 +264,7 @@ def mark_interrupted(db: Database, state: Path) -> None:
                 detail = "the service ended before it began; nothing has moved, request it again"
             else:
                 continue
-            rows.ended(db, row["id"], "interrupted", detail)
+            rows.mark_ended(db, row["id"], "interrupted", detail)
             if not running:
                 forget_unmade(db, state, row)
             note(db, "service", "job interrupted", row["id"])
@@ -355,7 +355,7 @@ def explain_interrupted(
                 on_ended(job)
             elif words != recorded.setdefault(job, " is being looked for"):
                 recorded[job] = words
-                rows.explain(db, job, f"{END_UNOBSERVED}{words}")
+                rows.set_detail(db, job, f"{END_UNOBSERVED}{words}")
         if left:
             closing.wait(_LOOK)
 
@@ -368,7 +368,7 @@ def _explain(db: Database, state: Path, row: Row) -> None:
     except (IdentError, OSError) as error:
         detail = f"{detail}; its folder could not be entered: {error}"
     forget_unmade(db, state, row)
-    rows.explain(db, row["id"], detail)
+    rows.set_detail(db, row["id"], detail)
 
 
 def _process(state: Path, row: Row) -> str:

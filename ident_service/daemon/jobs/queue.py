@@ -501,7 +501,7 @@ class Engine:
                 row = rows.add_job(
                     *(self.db, job, request.kind, order.arm, request.model_dump(mode="json"), list(order.words), by),
                     motion=order.moves,
-                    run=order.run,
+                    run_id=order.run,
                 )
                 note(self.db, by, "job created", job, kind=request.kind, arm=order.arm)
                 also_write(row)
@@ -645,7 +645,7 @@ class Engine:
 
     def _begin(self, live: LiveJob) -> None:
         folder = self.state / JOBS / live.job
-        if not rows.started(self.db, live.job, ""):
+        if not rows.mark_started(self.db, live.job, ""):
             self.live.remove(live)
             return
         if live.end_reason:  # cancelled while the registry was written
@@ -723,7 +723,7 @@ class Engine:
 
     def _finish(self, live: LiveJob, state: str, detail: str, code: int | None) -> None:
         with self.db.transaction():
-            entered = rows.ended(self.db, live.job, state, detail, code)
+            entered = rows.mark_ended(self.db, live.job, state, detail, code)
             if entered:
                 forget_unmade(self.db, self.state, rows.known_job(self.db, live.job))
                 note(self.db, live.by, "job ended", live.job, state=state, detail=detail)
@@ -745,11 +745,11 @@ class Engine:
         from pydantic import TypeAdapter
 
         reader: TypeAdapter[AnyJobRequest] = TypeAdapter(AnyJobRequest)
-        for row in rows.queue(self.db):
+        for row in rows.queued_jobs(self.db):
             try:
                 order = command_of_request(self.db, self.state, reader.validate_python(row["request"]))
             except (IdentError, ValueError) as error:
-                rows.ended(self.db, row["id"], "failed", f"it cannot be begun any more: {error}")
+                rows.mark_ended(self.db, row["id"], "failed", f"it cannot be begun any more: {error}")
                 forget_unmade(self.db, self.state, row)
                 continue
             # Its arguments and folder are those that were entered when it was requested.

@@ -25,7 +25,7 @@ from ident_service.operations.maintenance_schedule import LATE, mark_due, pendin
 from ident_service.registry.arms import known_arm
 from ident_service.registry.database import Row, note
 from ident_service.registry.jobs import LIVE, jobs
-from ident_service.registry.state_folder import control_path, fault_file
+from ident_service.registry.state_folder import arm_fault_store, control_path
 
 _TICK = 0.5  # s between passes
 LOG = logging.getLogger("ident.maintenance")
@@ -114,7 +114,7 @@ class MaintenanceScheduler:
             return "it is late, or the clock was changed"
         if not found or not found[0]["enabled"]:
             return "its schedule was removed or disabled"
-        if fault_file(self._state, arm).latched():
+        if arm_fault_store(self._state, arm).latched():
             return "a fault waits to be acknowledged"
         waiting = any(one["motion"] for one in jobs(self._db, states=LIVE, arm=arm, most=1000))
         if waiting or is_control_file_in_use(control_path(self._state, arm)):

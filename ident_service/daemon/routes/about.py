@@ -24,7 +24,7 @@ from ident_service.errors import IdentError
 from ident_service.operations.drift_alarms import alarms
 from ident_service.operations.maintenance_schedule import pending
 from ident_service.registry.database import audit_log
-from ident_service.registry.state_folder import fault_file
+from ident_service.registry.state_folder import arm_fault_store
 from ident_service.registry.tokens import revoke_token, tokens
 
 router = APIRouter(tags=["service"], responses=failures(), generate_unique_id_function=operation_id)
@@ -64,7 +64,7 @@ def metrics(service: Serving, _: Viewer) -> PlainTextResponse:
     faults, place = dict[str, int](), service.state / "arms"
     for folder in place.iterdir() if place.is_dir() else ():
         try:
-            faults[folder.name] = len(fault_file(service.state, folder.name).latched())
+            faults[folder.name] = len(arm_fault_store(service.state, folder.name).latched())
         except IdentError:
             faults[folder.name] = 1  # a damaged file prevents motion like a fault
     jobs = {(row["kind"], row["state"]): row["number"] for row in rows}
@@ -113,7 +113,7 @@ def logout(service: Serving, response: Response, cookie: Cookie = None) -> None:
 def audit(page: Page, service: Serving, _: Viewer, before: BeforeNumber = None, most: Most = 100) -> list[AuditLine]:
     """List the lines of the audit trail, the newest first."""
     service.engine.audit.flush(AUDIT_SECONDS)
-    return [AuditLine(**row) for row in page(most, lambda n: audit_log(service.db, before=before, most=n))]
+    return [AuditLine(**row) for row in page(most, lambda n: audit_log(service.db, before_id=before, max_lines=n))]
 
 
 @router.get("/api/v1/tokens")

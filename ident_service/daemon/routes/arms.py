@@ -32,7 +32,7 @@ from ident_service.registry import arms as known
 from ident_service.registry import motions
 from ident_service.registry.database import LONGEST_NOTE, note
 from ident_service.registry.runs import run_folder
-from ident_service.registry.state_folder import control_path, fault_file
+from ident_service.registry.state_folder import arm_fault_store, control_path
 
 router = api_router("arms", 404)
 Text = Annotated[str, Field(max_length=known.MOST_BYTES)]
@@ -145,8 +145,8 @@ def add_arm(service: Serving, who: Operator, body: NewArm) -> answers.AddedArmAn
         added = known.add_arm(
             *(service.db, service.state, text, files, who.name),
             replace=body.replace,
-            judge=lambda path: judged.update(judge_apart(path)),
-            draw=(lambda path, out: draw_apart(path, Path(place), out)) if body.meshes else None,
+            check_description=lambda path: judged.update(judge_apart(path)),
+            make_meshes=(lambda path, out: draw_apart(path, Path(place), out)) if body.meshes else None,
         )
     return answers.AddedArmAnswer(**_arm(service, added.name).model_dump(), objections=judged.get("objections"))
 
@@ -189,7 +189,7 @@ def list_faults(service: Serving, _: Viewer, arm: ArmName) -> list[answers.Fault
 def acknowledge(service: Serving, who: Operator, arm: ArmName, code: Id) -> answers.FaultAnswer:
     """Acknowledge a fault by its code; return its cause and when it arose."""
     name = known.known_arm(service.db, service.state, arm).name
-    file = fault_file(service.state, name)
+    file = arm_fault_store(service.state, name)
     since = {one.code: one.since for one in file.remembered()}
     cause = file.acknowledge(code)
     note(service.db, who.name, "fault acknowledged", name, code=code, cause=cause)
@@ -305,7 +305,7 @@ def describe(service: Serving, _: Operator, body: NewDescription) -> NewDescript
 @router.post("/descriptions/check")
 def check(service: Serving, _: Operator, body: Description) -> DescriptionAnswer:
     """Check a description without keeping it; its mistakes are answered with line and column."""
-    with service.checks.slot(), known.uploaded(service.state, body.description, body.files) as path:
+    with service.checks.slot(), known.temporary_upload(service.state, body.description, body.files) as path:
         load_arm(path, upload=True)  # finds most mistakes, without a process
         return DescriptionAnswer(**judge_apart(path))
 
@@ -332,7 +332,7 @@ def _arm(service: Service, arm: str) -> answers.ArmAnswer:
         unattended_motion=config.unattended_motion,
         resources=list(known.resources(config)),
         moved_by=controlling_pid(control_path(service.state, found.name)),
-        faults=[answers.FaultAnswer(**asdict(one)) for one in fault_file(service.state, found.name).remembered()],
+        faults=[answers.FaultAnswer(**asdict(one)) for one in arm_fault_store(service.state, found.name).remembered()],
         accepted=answers.AcceptanceAnswer(**asdict(acts[-1])) if acts else None,
     )
 

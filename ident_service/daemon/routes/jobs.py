@@ -106,15 +106,15 @@ def create_job(
     if body.job.kind in MOVES:
         raise UsageError("a motion has no Idempotency-Key: its challenge is valid once, and it must not begin later")
     asked = hashlib.sha256(body.job.model_dump_json().encode()).hexdigest()
-    if (row := rows.job_of_key(service.db, who.name, idempotency_key, asked)) is None:
+    if (row := rows.job_of_idempotency_key(service.db, who.name, idempotency_key, asked)) is None:
 
         def enter(job: Row) -> None:
-            rows.enter_key(service.db, who.name, idempotency_key, asked, job["id"])
+            rows.store_idempotency_key(service.db, who.name, idempotency_key, asked, job["id"])
 
         try:
             return job_answer_document(service, service.engine.create(body.job, who.name, also_write=enter))
         except sqlite3.IntegrityError:  # the same request came twice at once, and the other one was entered first
-            row = rows.job_of_key(service.db, who.name, idempotency_key, asked)
+            row = rows.job_of_idempotency_key(service.db, who.name, idempotency_key, asked)
             if row is None:
                 raise
     response.headers["Idempotent-Replayed"] = "true"

@@ -158,7 +158,7 @@ def view_arm(
 @router.get("/arms/{arm}/meshes/{sha256}/{joint}", response_class=Response, responses=_BINARY)
 def get_mesh(service: Serving, _: Viewer, arm: ArmName, sha256: ShortHash, joint: JointNumber) -> Response:
     """Return the triangles of a joint, or of the base (-1), as bytes; a view's `figure.meshes` has the address."""
-    triangles = known.mesh_file(service.state, arm, sha256, joint)
+    triangles = known.mesh_bytes(service.state, arm, sha256, joint)
     return Response(triangles, media_type="application/octet-stream", headers={"Cache-Control": "private, max-age=600"})
 
 

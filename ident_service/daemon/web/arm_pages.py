@@ -54,7 +54,7 @@ from ident_service.registry import runs as known_runs
 from ident_service.registry.database import Database, Row
 from ident_service.registry.motions import motions
 from ident_service.registry.runs import EXPORTS, REPORTS
-from ident_service.registry.state_folder import control_path, fault_file, ticket_path
+from ident_service.registry.state_folder import arm_fault_store, control_path, ticket_path
 from ident_service.registry.tokens import Access
 
 StepState = Literal["done", "skipped", "next", "open", "busy"]
@@ -301,7 +301,7 @@ def list_arms(service: Serving, who: Viewer) -> Response:
     for row in known.arm_names(db):
         name = row["name"]
         try:
-            faults = len(fault_file(service.state, name).latched())
+            faults = len(arm_fault_store(service.state, name).latched())
         except IdentError:
             faults = 1  # a damaged file prevents motion like a fault
         facts = arm_facts(service.state, row)

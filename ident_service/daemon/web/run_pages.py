@@ -403,5 +403,5 @@ def compare(service: Serving, who: Viewer, reference: Id, other: Id) -> Response
 def audit(service: Serving, who: Viewer, before: Annotated[int, Query(ge=0, lt=2**62)] | None = None) -> Response:
     """List the lines of the audit trail, the newest first."""
     service.engine.audit.flush(AUDIT_SECONDS)
-    lines = audit_log(service.db, before=before, most=100)
+    lines = audit_log(service.db, before_id=before, max_lines=100)
     return page("audit", who, lines=lines, more=len(lines) == 100)
