@@ -229,7 +229,7 @@ class Arm(ABC):
         return ()
 
     def withhold(self, kind: str) -> None:  # noqa: B027 - nothing to do where watchdogs watch torque frames
-        """Stop sending what watchdogs of one kind watch, until the next `stop`, so that they act; go on with the rest.
+        """Starve the watchdogs of one kind until the next `stop`, so that they act; no-op for torque frames.
 
         Watchdogs of torque frames need none of it: `exchange(None)` withholds those.
         """

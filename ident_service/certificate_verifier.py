@@ -1205,7 +1205,7 @@ def _require_names(given: frozenset[str], wanted: frozenset[str], where: str) ->
 
 
 def read_file(path: Path) -> str:
-    """Return the text of a UTF-8 file; raise if it is longer than `MAX_FILE_CHARACTERS` bytes, or a device or pipe.
+    """Return a file's text; VerificationError: too long or not UTF-8, OSError: unreadable, device or pipe.
 
     Raises:
         OSError: it cannot be read, or is a device or pipe, which may never end.

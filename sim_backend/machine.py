@@ -165,7 +165,7 @@ class Drives:
 
     @property
     def status(self) -> tuple[int, ...]:
-        """Return the `AxisStatus` bits of each axis."""
+        """Return the `AxisStatus` bits of each axis, as of the last `latch` or `hold`."""
         return self._words
 
     @property

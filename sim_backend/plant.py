@@ -334,7 +334,7 @@ class Plant:
         self._position, self._velocity, self._acceleration, self._rate = state
 
     def state_after(self, torque: Array, period: float | None = None) -> PlantState:
-        """Return the state to which `step` would lead, and leave the plant where it is."""
+        """Return the state to which `step` would lead, plant unmoved; DriverError if the arm runs away."""
         h = self._period if period is None else period
         if h != self._stepped:
             self._stepped, self._half = h, 0.5 * h

@@ -53,7 +53,7 @@ def require_format(path: Path | str) -> Path:
 
 
 def logged_links(links: Sequence[Link], log_file: Path, fd: Sequence[bool]) -> tuple[SessionLog, list[Link]]:
-    """Wrap open links so that their frames go into a new file; returns its log, to be closed after them, and the links.
+    """Wrap links to log to a new file; return its log, to be closed last, and them; failing closes them.
 
     Args:
         links: of all buses.

@@ -435,7 +435,7 @@ class CanopenArm(Arm):
         return budget(self._driver, self._config.control.rate if rate is None else rate)
 
     def setup_checks(self) -> tuple[SetupCheck, ...]:
-        """Return a failed check of each controller of the host that is error-passive or bus-off; else empty."""
+        """Return a failed check per controller that error frames call error-passive or bus-off; else empty."""
         codecs = self._open().codecs
         return tuple(one for codec in codecs for one in controller_checks(codec.profile.bus.channel, codec.controller))
 

@@ -652,8 +652,9 @@ def _stop(arguments: argparse.Namespace) -> Answer:
     os.umask(0o077)  # and no more: a stop is not refused for a folder that others can enter, or that is another's
     try:
         return _stopped(arguments, state_folder(arguments))
-    except (UsageError, DriverError, PermissionError):
-        if (refusal := access_refusal(state_folder(arguments))) is None:
+    except (UsageError, DriverError, PermissionError) as error:
+        refusal = access_refusal(state_folder(arguments))
+        if refusal is None or (isinstance(error, IdentError) and error.facts.get("arms")):
             raise
         raise UsageError(
             f"nothing was stopped: {refusal}; or stop through its daemon: ident stop --server URL"
@@ -666,10 +667,14 @@ def _stopped(arguments: argparse.Namespace, state: Path) -> Answer:
     from ident_service.registry.state_folder import control_path, give_to_owner, known_arms
 
     if arguments.arm is None:
-        reached = stop_arms(state, None)
+        reached, failures = stop_arms(state, None)
         for name in known_arms(state):  # a file was made where there was none
             give_to_owner(state, control_path(state, name))
         write_audit_entry(arguments, "stop", "all arms", reached=reached)
+        for failure in failures:
+            failure.facts = {"arms": reached}
+            failure.add_note(f"stopped: {', '.join(reached) or 'no arm'}")
+            raise failure
         return DONE, stop_text(None, reached), {"arms": reached, "asked": "stop"}
     name, path = _control(arguments)
     pid = ControlFile.stop_motions(path)

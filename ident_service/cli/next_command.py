@@ -97,7 +97,9 @@ def _job_refusal(arguments: argparse.Namespace, said: Mapping[str, Any]) -> str:
     error = said.get("error")
     if not isinstance(error, dict):
         return ""
-    kind = getattr(errors, str(error.get("kind")), IdentError)
+    kind = getattr(errors, str(error.get("kind")), None)
+    if not (isinstance(kind, type) and issubclass(kind, IdentError)):  # of another version
+        return ""
     return next_after_error(arguments, kind, str(error.get("message", "")))
 
 

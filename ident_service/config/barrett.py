@@ -190,7 +190,7 @@ def disagreements(
     rate: float,
     joints_without_home: Sequence[str] = (),
 ) -> Iterator[tuple[tuple[str | int, ...], str]]:
-    """Yield (key path, message) for each contradiction of section `driver` with joints, homes, gears or rate.
+    """Yield (key path, message): no home, short heartbeat, wrong gears, joints, `lost_cycles` or `ipnm`.
 
     Args:
         driver: the section `driver`.

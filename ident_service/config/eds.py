@@ -74,7 +74,7 @@ class DataSheetEntry:
         return self.access != "wo"
 
     def number(self, node_id: int) -> int | None:
-        """Return the entry's value as a number in any notation that makers use; None where it is empty or unreadable.
+        """Return the DCF's value, else the default, as a number in any maker's notation; else None.
 
         Args:
             node_id: node number that COB-IDs are relative to.

@@ -224,7 +224,7 @@ def motor_disagreements(
     joints: Sequence[str],
     rate: float,
 ) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Yield (key path, message) for each contradiction between motors on a bus, gears, joints and `lost_cycles`.
+    """Yield (key path, message): no `transmission`, wrong count of ratios or joints, too many `lost_cycles`.
 
     Args:
         motors_name_and_key: the motors' name, and their key in the section `driver`.

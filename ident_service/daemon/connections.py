@@ -130,7 +130,7 @@ class Connections:
                 self._waiting[peer] = self._now() + BODY_SECONDS
 
     def request_received(self, peer: Peer | None) -> None:
-        """Note that a request has been received whole: its connection has no deadline until the answer."""
+        """Note that a request has been received whole: no deadline until its answer begins to be sent."""
         if peer is not None:
             self._waiting.pop(peer, None)
 

@@ -148,7 +148,7 @@ class Upload:
 
 
 def begin_upload(db: Database, state: Path, announced: Announced) -> Upload:
-    """Begin or resume an upload; return it with the bytes that have arrived, or the run if it is complete.
+    """Begin an upload in a folder, or resume the same person's; return it with the bytes there, or its run.
 
     Args:
         db: the registry.

@@ -10,13 +10,13 @@ parameters are; what the motion does not show (inertia where it is slow) has inf
 covariance of x has two parts: noise, from blocks of scores as in `uncertainty.py`, and the arm's own uncertainty, which
 on this motion looks like a payload: x depends on beta by -G = -(K_x^T W^T W K_x)^-1 K_x^T W^T W, so G cov(beta) G^T.
 
-A body that was added has a pseudo-inertia >= 0, one that was taken off has the negative of one. Of both sets the point
-nearest to x in the metric of its covariance is sought, and told by its distance (`drift.probability`) and by the torque
-that lies between: too far from both means that no single body explains the recording, as when one tool was exchanged
-for another. Of the bodies that move like that point (to a hundredth of its deviations) the one most like a ball is
-told: what no motion shows has the size that a load of this mass has. No single body explains a recording without a
-payload whose residual is far above that of the identification, either: a small body is easily lost in it, and the arm
-does not move as it was identified.
+A body that was added has a pseudo-inertia >= 0, one that was taken off has the negative of one. Of both sets the
+point nearest to x in the metric of its covariance is sought, and told by its distance (`p_value`,
+`change_detection.py`) and by the torque that lies between: too far from both means that no single body explains the
+recording, as when one tool was exchanged for another. Of the bodies that move like that point (to a hundredth of its
+deviations) the one most like a ball is told: what no motion shows has the size that a load of this mass has. No
+single body explains a recording without a payload whose residual is far above that of the identification, either: a
+small body is easily lost in it, and the arm does not move as it was identified.
 
 A parameter's verdict compares its deviation with the larger of its size and what is as good as zero: what makes 1 % of
 a joint's torque on this motion, or what a body of this mass, at least 100 g, has 5 cm from the frame, if that is less.

@@ -252,7 +252,7 @@ class CapsuleModel:
         return self._smallest.copy()
 
     def pull(self, seeds: Array) -> Array:
-        """Return the gradient of `sum(seeds * distances)` at the last positions, shape (samples, joints).
+        """Return the gradient of `sum(seeds * last distances)`, (samples, joints); seeds (pairs, samples).
 
         Args:
             seeds: shape (pairs, samples).

@@ -91,7 +91,7 @@ class Controls(Protocol):
 
     @property
     def homing(self) -> Homing:
-        """Return the stage of leading the held arm home: `NONE`, `ASKED`, then what `tell_homing` has set."""
+        """Return the stage of the last request home: `NONE`, `ASKED`, then what `tell_homing` set; it stays."""
 
     def tell_homing(self, stage: Homing) -> None:
         """Set the stage of leading the arm home; while it is `GOING`, `lease_ok` checks who requested the way home."""
@@ -362,11 +362,11 @@ class ControlFile:
 
 
 def controlling_pid(control_file: Path) -> int | None:
-    """Return the id of the process that moves the arm of a control file, None when no process does."""
+    """Return the id of the process that moves the arm of a control file; None if none does, or it cannot be opened."""
     try:
         with ControlFile.reach(control_file) as controls:
             return controls.pid
-    except UsageError:
+    except (UsageError, DriverError):
         return None
 
 

@@ -260,7 +260,7 @@ class _Watch:
     def _take(self, output: dict[str, Any]) -> None:
         if "pid" in output:
             self.ending.taken = True
-            with suppress(UsageError):  # it died at once, as the next read will show
+            with suppress(UsageError, DriverError):  # it died at once, or its lease lapses, as its output will say
                 self._controls = ControlFile.reach(self._path)
         self.ending.report = output.get("report", self.ending.report)
         self.ending.error = output.get("error", self.ending.error)

@@ -7,19 +7,20 @@ from pathlib import Path
 from typing import Literal
 
 from ident_service.errors import DriverError, UsageError
-from ident_service.motion.command_channel import ControlFile, controlling_pid
+from ident_service.motion.command_channel import ControlFile
 from ident_service.registry.state_folder import control_path
 
 
-def stop_arms(state: Path, arm: str | None) -> list[str]:
-    """Request a controlled stop of an arm, or all, and block motions asked for before; return the arms reached.
+def stop_arms(state: Path, arm: str | None) -> tuple[list[str], list[DriverError]]:
+    """Request a controlled stop of an arm, or all, and of motions asked for before; return arms reached, and failures.
 
     Args:
         state: the state folder.
         arm: name of the arm; None for all that ever moved.
 
-    Raises:
-        DriverError: the control file of one cannot be opened; all others have been reached.
+    Returns:
+        The names of the arms that a process moves or holds; an error for each whose control file cannot be opened: it
+        may move, and has NOT been stopped over that file.
     """
     return _reach(state, arm, ControlFile.stop_motions)
 
@@ -31,8 +32,8 @@ def ask_process(control_file: Path, request: Asked) -> int:
     """Write a request into a control file for the process that holds it, do not wait; return that process's id.
 
     Args:
-        control_file: of the control file.
-        request: request: pause, or go on; finish a run early by its regular end, out of a pause too; or release an arm
+        control_file: path of the file.
+        request: pause, or go on; finish a run early by its regular end, out of a pause too; or release an arm
             that is held after a stop, since a person sees it supported.
 
     Raises:
@@ -50,36 +51,49 @@ def ask_process(control_file: Path, request: Asked) -> int:
 
 
 def ask_arm(state: Path, arm: str, request: Asked) -> bool:
-    """Send a request, such as `pause`, to the process that moves or holds an arm; return whether there was one."""
-    return bool(_reach(state, arm, lambda path: ask_process(path, request)))
+    """Send a request, such as `pause`, to the process that moves or holds an arm; return whether there was one.
+
+    Raises:
+        DriverError: the control file cannot be opened.
+    """
+    reached, failures = _reach(state, arm, lambda path: ask_process(path, request))
+    for failure in failures:
+        raise failure
+    return bool(reached)
 
 
 def is_held(state: Path, arm: str) -> bool:
-    """Tell whether an arm without brakes is held after a stop until a person confirms that it is supported."""
+    """Return whether an arm is seen to be held after a stop, until a person confirms that it is supported."""
     try:
         with ControlFile.reach(control_path(state, arm)) as controls:
             return controls.waiting
-    except UsageError:  # nobody moves or holds it
+    except (UsageError, DriverError):  # nobody moves or holds it, or nobody can see that
         return False
 
 
 def moving_arms(state: Path) -> list[str]:
-    """Return the names of the arms that any process moves or holds."""
-    return _reach(state, None, controlling_pid)
+    """Return the names of the arms that any process moves or holds, or whose control file cannot be opened."""
+    return _reach(state, None, _pid_if_any)[0]
 
 
-def _reach(state: Path, arm: str | None, act: Callable[[Path], int | None]) -> list[str]:
+def _pid_if_any(path: Path) -> int:
+    try:
+        with ControlFile.reach(path) as controls:
+            return controls.pid
+    except DriverError:
+        return 0  # it may move
+
+
+def _reach(state: Path, arm: str | None, act: Callable[[Path], int | None]) -> tuple[list[str], list[DriverError]]:
     place = state / "arms"
     there = [path.name for path in place.iterdir()] if place.is_dir() else []
-    reached, unreachable = [], []
+    reached, failures = list[str](), list[DriverError]()
     for name in there if arm is None else [arm] if arm in there else []:
         try:
             if act(control_path(state, name)) is not None:
                 reached.append(name)
         except DriverError as error:
-            unreachable.append(error)  # the others first: one arm keeps no stop from another
+            failures.append(error)
         except UsageError:  # no process moves it
             pass
-    if unreachable:
-        raise unreachable[0]
-    return sorted(reached)
+    return sorted(reached), failures

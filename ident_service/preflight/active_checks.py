@@ -223,7 +223,7 @@ def moved_against_torque(trace: Trace, joint: int, session: Session) -> bool:
 
 
 def swings_to_both_sides(trace: Trace, joint: int) -> bool:
-    """Return whether a joint was far from its reference on both sides: an unstable loop swings, a wrong sign does not.
+    """Return whether the error's smaller side is over 0.3 of its largest, however small: so swings a loop.
 
     A loop that is not stable swings, and by its delay seems to move against its torque.
     """

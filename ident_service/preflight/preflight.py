@@ -223,10 +223,15 @@ class _Preflight:
 
     def all_checks(self) -> list[Check]:
         """Return every check; those that were not made name the one that failed."""
-        because = next((code for code, check in self.checks.items() if check.verdict is Verdict.FAILED), None)
-        asked = any(check.verdict is Verdict.NEEDS_PERSON for check in self.checks.values())
-        why = "because nobody agreed to it" if asked else "not reached, although nothing failed before"
-        why = why if because is None else f"because {because} failed"
+        failures = [code for code, check in self.checks.items() if check.verdict is Verdict.FAILED]
+        # What fails of the motion alone lets the checks of the arm go on.
+        because = next((code for code in failures if code not in ABOUT_THE_MOTION), None)
+        if because is None and any(check.verdict is Verdict.NEEDS_PERSON for check in self.checks.values()):
+            why = "because nobody agreed to it"
+        elif failures:
+            why = f"because {because or failures[0]} failed"
+        else:
+            why = "not reached, although nothing failed before"
         made = dict(self.checks)
         if self.excitation is None:
             made |= {code: skipped_check(code, "no motion was given") for code in ("motion_fits", "motion_proven")}

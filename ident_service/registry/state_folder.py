@@ -48,7 +48,7 @@ def require_private(state: Path) -> None:
 
 
 def access_refusal(state: Path, *, writing: bool = False) -> str | None:
-    """Return why this process's user must not use a state folder, with the remedy; None if they may, or it is new.
+    """Return why a user must not use another's folder, even to read; None for one's own, open or new.
 
     Args:
         state: the folder.

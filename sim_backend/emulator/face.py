@@ -93,7 +93,7 @@ class EmulatedDevice(BusDevice, Protocol):
         """Set or clear a warning of the drive, and return the frames to send."""
 
     def switch_supply(self, on: bool, now_ns: int) -> list[Frame]:
-        """Switch the motors' power on or off, as an emergency stop does, and return the frames to send."""
+        """Switch the motors' power, or the whole arm's e-stop, and return the frames to send, if any."""
 
     def reboot(self, now_ns: int) -> list[Frame]:
         """Restart the firmware by itself, and return the frames to send."""

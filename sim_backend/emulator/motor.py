@@ -115,7 +115,7 @@ class Motor:
         self.defects = Defects()
 
     def power_up(self, now_ns: int) -> None:
-        """Start the firmware without power for the motor; a relative encoder counts from here."""
+        """Start the firmware with the motor off, defects kept; a relative encoder counts from here."""
         if self._relative:
             self._origin = round(self._rotor.angle(self._index, now_ns) * self._per_radian)
         self.switch_off(now_ns)

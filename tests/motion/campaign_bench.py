@@ -299,7 +299,7 @@ def play(
 
     if not lowers:
         arm.before_exchange = recorded
-    options: dict[str, Any] = {"latch": latch, "hold_seconds": HOLD, "speed": speed}
+    options: dict[str, Any] = {"active_faults": latch, "hold_seconds": HOLD, "speed": speed}
     script = Script(arm, which, state, speed, finish=finish)
     try:
         with arm, ExitStack() as stack:

@@ -147,7 +147,7 @@ def test_no_return_ends_the_pause(make: Callable[..., Bench], monkeypatch: pytes
 def test_an_arm_that_nobody_watches_stops(make: Callable[..., Bench], wish: str, code: str, cycle: int) -> None:
     bench, latch = make(), ActiveFaults()
     with pytest.raises(ArmFault) as caught:
-        played(bench, Hands(**{wish: cycle}), latch=latch)
+        played(bench, Hands(**{wish: cycle}), active_faults=latch)
     assert caught.value.code == code
     assert times(bench)["stopping"] == pytest.approx(cycle * PERIOD, abs=1.5 * PERIOD)
     assert bench.story.states[-2:] == ["stopping", "stopped"]
@@ -255,7 +255,7 @@ def test_an_arm_that_is_pushed_while_it_is_held_is_left_to_its_drives(make: Call
 def test_an_arm_that_does_not_follow_is_lowered(make: Callable[..., Bench]) -> None:
     bench, latch = make(Fault(350, FaultKind.LOAD_ATTACHED, None, None, 3.0)), ActiveFaults()
     with pytest.raises(ArmFault, match="following_lost: ") as caught:
-        played(bench, LocalCommands(), latch=latch)
+        played(bench, LocalCommands(), active_faults=latch)
     assert caught.value.code == "following_lost"
     assert [fault.code for fault in latch.faults] == ["following_error", "following_lost"]
     assert bench.story.states[-2:] == ["stopping", "faulted"]
@@ -270,16 +270,16 @@ def test_an_arm_that_does_not_follow_is_lowered(make: Callable[..., Bench]) -> N
 def test_a_latched_fault_refuses_the_next_run_until_it_is_acknowledged(make: Callable[..., Bench]) -> None:
     bench, latch = make(Fault(MIDWAY, FaultKind.NAN_POSITION, 0)), ActiveFaults()
     with pytest.raises(ArmFault):
-        played(bench, LocalCommands(), latch=latch)
+        played(bench, LocalCommands(), active_faults=latch)
     (fault,) = latch.faults
     assert fault.cause.startswith("shoulder: position is not a number: ")
     assert fault.since_ns == round(MIDWAY * PERIOD * 1e9)
     again = make()
     with pytest.raises(MotionRefused, match=r"unacknowledged faults: feedback_not_finite \(shoulder: "):
-        played(again, LocalCommands(), latch=latch)
+        played(again, LocalCommands(), active_faults=latch)
     again.nothing_was_enabled()
     latch.acknowledge("feedback_not_finite")
-    assert played(again, LocalCommands(), latch=latch).state is State.DONE
+    assert played(again, LocalCommands(), active_faults=latch).state is State.DONE
     assert latch.faults == ()
 
 

@@ -11,7 +11,7 @@ import pytest
 from ident_service.cli import main
 from ident_service.errors import DriverError, UsageError
 from ident_service.motion.command_channel import ControlFile, is_control_file_in_use
-from ident_service.operations.moving_arms import stop_arms
+from ident_service.operations.moving_arms import ask_arm, is_held, moving_arms, stop_arms
 from ident_service.registry.state_folder import control_path
 
 
@@ -148,7 +148,9 @@ def test_a_stop_that_cannot_be_written_says_so(tmp_path: Path) -> None:
         ControlFile.stop_motions(loop_path(tmp_path))
 
 
-def test_an_arm_whose_controls_cannot_be_opened_is_not_said_to_be_at_rest(tmp_path: Path) -> None:
+def test_an_arm_whose_controls_cannot_be_opened_is_not_said_to_be_at_rest(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Its process would not have been stopped. Others are, in the same call."""
     state = tmp_path / "state"
     for name in ("before", "moving", "unknown", "within"):
@@ -161,10 +163,21 @@ def test_an_arm_whose_controls_cannot_be_opened_is_not_said_to_be_at_rest(tmp_pa
     with pytest.raises(DriverError, match="cannot be opened: Is a directory"):
         ControlFile.reach(blocked)
     with ControlFile.take(control_path(state, "moving"), None) as loop:
-        with pytest.raises(DriverError, match="use the emergency stop"):
-            stop_arms(state, None)
+        reached, failures = stop_arms(state, None)
+        assert reached == ["moving"]
+        assert [name for name in ("before", "unknown", "within") if name in str(failures)] == [
+            "before",
+            "unknown",
+            "within",
+        ]
+        assert "use the emergency stop" in str(failures[0])
         assert loop.stop
-    assert main(["stop", "--state", str(state)]) == 1
+        assert main(["stop", "--state", str(state)]) == 1
+        assert "stopped: moving\n" in capsys.readouterr().err
+        assert moving_arms(state) == ["before", "moving", "unknown", "within"]  # which may move
+    assert not is_held(state, "unknown")
+    with pytest.raises(DriverError, match="cannot be opened"):
+        ask_arm(state, "unknown", "pause")
     blocked.rmdir()
     blocked.symlink_to(blocked)
     with pytest.raises(DriverError, match="Too many levels of symbolic links"):

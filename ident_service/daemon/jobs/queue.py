@@ -528,12 +528,15 @@ class Engine:
 
         Waits for nobody: the word to our own children is a line in a pipe, the control file is memory, and what the
         audit trail says of it is entered later.
+
+        Raises:
+            DriverError: the control file of an arm cannot be opened, which may move; all others have been reached.
         """
-        reached, ended = list[str](), self.live.stop(arm, f"{by} asked for a stop")
-        try:
-            reached = stop_arms(self.state, arm)
-        finally:
-            self.audit.note(by, "stop", arm or "all arms", reached=reached, jobs=ended)
+        ended = self.live.stop(arm, f"{by} asked for a stop")
+        reached, failures = stop_arms(self.state, arm)
+        self.audit.note(by, "stop", arm or "all arms", reached=reached, jobs=ended)
+        for failure in failures:
+            raise failure
         return {"arms": reached, "jobs": ended}
 
     def ask(self, arm: str, request: Asked, by: str) -> bool:

@@ -21,7 +21,7 @@ _OPTIONS_OF_LOOKS = ("--json", "--with-text", "--state", "--tell-samples")
 
 
 def main() -> int:
-    """Read a request from stdin and replace this process by its command; return 1 without one, 2 if not allowed."""
+    """Become the command requested on stdin, output into files; return 1 if stdin ends first, 2 if refused."""
     line = bytearray()
     # Byte by byte: the input after the line belongs to the command.
     while not line.endswith(b"\n") and len(line) < _MOST:

@@ -36,7 +36,7 @@ LastEvent = Annotated[
         alias="Last-Event-ID",
         ge=0,
         lt=2**62,
-        description="the last `id` that was seen; everything that has happened since is while_known first",
+        description="the last `id` that was seen; everything that has happened since comes first",
     ),
 ]
 After = Annotated[int | None, Query(ge=0, lt=2**62, description="the same, for whoever cannot send that header")]

@@ -122,7 +122,7 @@ def create_job(
 
 
 def begin_job(service: Service, who: Access, body: JobRequest) -> answers.JobAnswer:
-    """Queue the job of a request to the API or of a page; refuse a motion that no person has confirmed.
+    """Queue a job, rights unchecked; a motion, even simulated, needs its challenge and the arm's typed name.
 
     Raises:
         MotionRefused: a motion that no person has confirmed.

@@ -155,7 +155,7 @@ def delete_run(service: Serving, who: Operator, run: Id, anyway: answers.Anyway 
 
 @router.post("/recordings/prune")
 def prune(service: Serving, who: Operator, body: Pruning) -> PruningAnswer:
-    """List old recordings of runs that nobody accepted and no job needs; with `yes`, delete them."""
+    """List recordings beyond each arm's `keep` newest runs that nobody accepted or needs; `yes` deletes."""
     unreadable = runs.rebuild_runs(service.db, service.state)
     gone = (
         run_archive.prune(service.db, service.state, body.keep, who.name)

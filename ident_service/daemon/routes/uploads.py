@@ -53,7 +53,7 @@ class UploadAnswer(BaseModel):
 
 @router.post("/uploads", status_code=201)
 def begin_upload(service: Serving, who: Operator, body: NewUpload) -> UploadAnswer:
-    """Announce a recording; return how much of it has arrived before, or the run that it is already."""
+    """Begin an upload in a folder, or resume the same person's; return it with the bytes there, or its run."""
     announced = uploads.Announced(**body.model_dump(), by=who.name)
     try:
         return _answer(uploads.begin_upload(service.db, service.state, announced))

@@ -536,7 +536,7 @@ class Finding:
 
 
 def findings(pair: Pair) -> tuple[Finding, ...]:
-    """Return the changes between the reference and a side; empty unless the verdict is `changed`."""
+    """Describe what changed from the reference to a side: one finding at least if `changed`, else none."""
     found, compared = pair.drift, pair.compared
     if found is None or compared is None or found.verdict != "changed":
         return ()

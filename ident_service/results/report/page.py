@@ -118,7 +118,7 @@ def _others(evidence: Evidence) -> list[tuple[str, Array]]:
 
 
 def verdict_rule() -> str:
-    """Return the meaning of the verdict column's words, and of the deviation beside them."""
+    """Return the text on the verdict column's words and on the standard deviation sigma beside them."""
     known, weak, share = 100 * IDENTIFIED_BELOW, 100 * WEAK_BELOW, NEGLIGIBLE_TORQUE
     return (
         f"Identified: \u03c3 is below {known:g} % of the parameter, or changes no joint's torque by more than "
