@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Self
 
-from ident_service.cli.output import person_types
+from ident_service.cli.output import person_types, print_to_person
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -202,12 +202,16 @@ def step_of(arguments: argparse.Namespace) -> Callable[..., None]:
 
 
 def ask(arguments: argparse.Namespace, question: str) -> str:
-    """Print a question at the terminal, the bar hidden meanwhile, and return the line that the person types."""
+    """Print a question at the terminal, the bar hidden, and return the line that the person types; empty for Ctrl-D."""
     bar: Any = getattr(arguments, "progress", None)
-    if bar is None:
-        return input(question)
-    with bar.hidden():
-        return input(question)
+    try:
+        if bar is None:
+            return input(question)
+        with bar.hidden():
+            return input(question)
+    except EOFError:
+        print_to_person("\n")
+        return ""
 
 
 def typed_confirmation(arguments: argparse.Namespace, question: str) -> str:

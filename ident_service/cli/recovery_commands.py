@@ -270,7 +270,7 @@ def _reidentify(arguments: argparse.Namespace) -> Answer:
         confirm = [] if arguments.confirm is None else ["--confirm", arguments.confirm]
         code, text, _ = _step(arguments, "preflight", arguments.arm, *motion, *confirm)
         if code != DONE:
-            raise PersonNeeded(f"{config.name}: preflight found reasons not to move\n{text}")
+            raise PersonNeeded(f"{config.name}: not allowed to move by its preflight\n{text}")
         recorded = new_id(config.name)
         _, _, moved = _step(arguments, "run", arguments.arm, *motion, "--out", str(state / RUNS / recorded))
         index_run(db, state, recorded)

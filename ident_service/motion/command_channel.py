@@ -374,12 +374,12 @@ def stop_requested_ns(control_file: Path) -> int:
     """Return when a stop of the arm was asked for last [ns of the machine's monotonic clock]; 0 where none is known."""
     try:
         fd = os.open(control_file, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            stamp = os.pread(fd, 8, _STOPPED)
+        finally:
+            os.close(fd)
     except OSError:
         return 0
-    try:
-        stamp = os.pread(fd, 8, _STOPPED)
-    finally:
-        os.close(fd)
     return int(struct.unpack("<q", stamp)[0]) if len(stamp) == 8 else 0
 
 

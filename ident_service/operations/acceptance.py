@@ -73,10 +73,11 @@ def accept(db: Database, state: Path, folder: Path, note: str, who: str, *, arm:
         UsageError: no note, no name, nothing was identified in the folder, or it is about another arm.
         MustNotBeUsed: its file does not prove, for the arm's conditions, that a body can have these parameters; or says
             that they must not be used.
-        ParameterError: the folder is not what its manifest names.
+        ParameterError: the folder is not what its manifest names, or its covariance is none.
     """
     from ident_service.operations.verify import verify_file
     from ident_service.results.assessment import forbidden_because
+    from ident_service.results.comparison.comparison import ComparedSet
     from ident_service.results.run_folder import read_results
 
     note, who = _noted(note), _named(who)
@@ -88,6 +89,8 @@ def accept(db: Database, state: Path, folder: Path, note: str, who: str, *, arm:
         raise MustNotBeUsed(f"{folder}: must not be used: {reasons}; identify again and accept that")
     if (proof := verify_file(folder, str(folder / ARM))).verdict != "feasible":
         raise MustNotBeUsed(f"{folder}: proves no feasible parameters ({proof.message}); see `ident verify {folder}`")
+    # What a re-identification will compare with, which begins with a motion.
+    _ = ComparedSet(folder, results.sha256[PARAMETERS], results.parameters, results.config).covariance
     if arm not in (None, results.config.name):
         raise UsageError(f"{folder.name} is about the arm {results.config.name}, not {arm}")
     arm = results.config.name
@@ -120,10 +123,10 @@ def rollback(
         ParameterError: the set's files were changed after the acceptance.
     """
     note, who = _noted(note), _named(who)
+    if not acceptances(state, arm):  # before anything is made for an arm of this name
+        raise UsageError(f"{arm}: nothing has been accepted yet")
     with _acting(state, arm):
         acts = acceptances(state, arm)
-        if not acts:
-            raise UsageError(f"{arm}: nothing has been accepted yet")
         if acceptance_number is None:
             earlier = [act for act in acts if act.number == act.origin and act.number < acts[-1].origin]
             if not earlier:

@@ -227,7 +227,7 @@ class _Preflight:
         # What fails of the motion alone lets the checks of the arm go on.
         because = next((code for code in failures if code not in ABOUT_THE_MOTION), None)
         if because is None and any(check.verdict is Verdict.NEEDS_PERSON for check in self.checks.values()):
-            why = "because nobody agreed to it"
+            why = "because nobody typed the arm's name"
         elif failures:
             why = f"because {because or failures[0]} failed"
         else:

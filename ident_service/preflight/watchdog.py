@@ -69,7 +69,7 @@ def consent_check(model: ArmModel, sample: Sample, confirm: Confirm) -> Check | 
         return None
     wrong = f"{typed.strip()!r} is not" if typed.strip() else "nobody typed"
     why = f"{wrong} the arm's name, {name}, so the arm got no torque and the drives' watchdog was not tried"
-    remedy = "Support the arm, step out of its reach, check again and type its name when asked."
+    remedy = f"Support the arm, step out of its reach, check again and type its name when asked, or --confirm {name}."
     return Check(CODE, Verdict.NEEDS_PERSON, (), why, remedy)
 
 

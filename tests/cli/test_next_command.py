@@ -17,7 +17,7 @@ from helpers.tickets import write_checked_ticket
 from ident_service.cli import parser
 from ident_service.cli.next_command import _FOLLOWS, next_after_error, next_line, with_arm
 from ident_service.config.load import load_arm
-from ident_service.errors import ArmFault, IdentError, MotionRefused, PositionUnknown, UsageError
+from ident_service.errors import ArmFault, IdentError, MotionRefused, PersonNeeded, PositionUnknown, UsageError
 
 TOP = parser()
 
@@ -135,6 +135,7 @@ ERRORS: list[tuple[str, IdentError, str]] = [
     ("simulate planar2", ArmFault("following_error", "x"), ""),
     ("watch my.yaml", PositionUnknown("not zeroed"), "next: ident set-home my.yaml\n"),
     ("reidentify planar2", UsageError("planar2: nothing has been accepted yet"), "next: ident preflight planar2\n"),
+    ("reidentify planar2", PersonNeeded("not allowed to move by its preflight"), "next: ident reidentify planar2\n"),
 ]
 
 

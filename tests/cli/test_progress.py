@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import argparse
 import fcntl
+import io
 import json
 import os
 import pty
@@ -19,7 +21,7 @@ import pytest
 from cli.conftest import COARSE, Commissioned, quick_arm
 from helpers.tickets import write_checked_ticket
 
-from ident_service.cli.progress import Mark, estimate, time_left
+from ident_service.cli.progress import Mark, ask, estimate, time_left
 from ident_service.config.load import load_arm
 
 # The command with a bar that appears at once and is redrawn often, so that the test need not take long.
@@ -162,3 +164,8 @@ def test_a_terminal_that_takes_nothing_more_stops_no_motion(tmp_path: Path) -> N
     assert json.loads((folder / "ended.json").read_text())["state"] == "done"
     assert "exciting" in lines_of(terminal.read())
     assert terminal.process.returncode == 0
+
+
+def test_the_end_of_input_at_a_question_is_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO(""))
+    assert ask(argparse.Namespace(), "type its name: ") == ""

@@ -101,6 +101,32 @@ def test_what_is_not_whole_or_not_feasible_is_not_accepted(db: Database, state: 
         rollback(db, state, "quick", "back", "me")
 
 
+@pytest.mark.parametrize("forged", ["lighter", "certificate", "covariance"])
+def test_what_is_accepted_proves_itself(db: Database, state: Path, folder: Path, forged: str) -> None:
+    """A manifest is made again by whoever forges; the certificate is not."""
+    document = json.loads((folder / "parameters.json").read_text())
+    if forged == "lighter":
+        document["base_parameters"]["values"][0] = -1.0
+    elif forged == "certificate":
+        certificate = document["feasibility"]["certificate"]
+        certificate["kind"] = "dual" if certificate["kind"] == "witness" else "witness"
+    else:
+        document["base_parameters"]["covariance"][0][1] += 1.0
+    (folder / "parameters.json").write_text(json.dumps(document))
+    write_manifest(folder)
+    with pytest.raises(ParameterError if forged == "covariance" else MustNotBeUsed):
+        accept(db, state, folder, "trust me", "me")
+    assert acceptances(state, "quick") == []
+
+
+@pytest.mark.parametrize("name", ["nobody", "../../elsewhere"])
+def test_nothing_is_made_for_an_arm_of_which_nothing_was_accepted(db: Database, state: Path, name: str) -> None:
+    before = sorted(state.parent.rglob("*"))
+    with pytest.raises(UsageError, match="nothing has been accepted yet"):
+        rollback(db, state, name, "back", "me")
+    assert sorted(state.parent.rglob("*")) == before
+
+
 def test_a_set_that_was_changed_behind_our_back_is_not_rolled_back_to(db: Database, state: Path, folder: Path) -> None:
     accept(db, state, folder, "one", "me")
     accept(db, state, folder, "two", "me")

@@ -96,7 +96,7 @@ def test_without_the_name_nothing_is_energised(typed: str, why: str) -> None:
     assert check.verdict is Verdict.NEEDS_PERSON
     assert check.reason.startswith(why)
     assert "type its name" in check.remedy
-    assert check_of(ticket, "direction").reason == "because nobody agreed to it"
+    assert check_of(ticket, "direction").reason == "because nobody typed the arm's name"
     assert "enable" not in flight.arm.calls
     assert flight.arm.torques == []
 

@@ -10,7 +10,7 @@ import pytest
 
 from ident_service.cli import main
 from ident_service.errors import DriverError, UsageError
-from ident_service.motion.command_channel import ControlFile, is_control_file_in_use
+from ident_service.motion.command_channel import ControlFile, is_control_file_in_use, stop_requested_ns
 from ident_service.operations.moving_arms import ask_arm, is_held, moving_arms, stop_arms
 from ident_service.registry.state_folder import control_path
 
@@ -176,6 +176,7 @@ def test_an_arm_whose_controls_cannot_be_opened_is_not_said_to_be_at_rest(
         assert "stopped: moving\n" in capsys.readouterr().err
         assert moving_arms(state) == ["before", "moving", "unknown", "within"]  # which may move
     assert not is_held(state, "unknown")
+    assert stop_requested_ns(blocked) == 0  # a daemon asks that of every arm that waits
     with pytest.raises(DriverError, match="cannot be opened"):
         ask_arm(state, "unknown", "pause")
     blocked.rmdir()

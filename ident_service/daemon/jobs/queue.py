@@ -45,7 +45,7 @@ from ident_service.daemon.jobs.outcome import (
 )
 from ident_service.daemon.jobs.requests import AnyJobRequest
 from ident_service.daemon.metrics import Metrics
-from ident_service.errors import DiskFull, IdentError, MotionRefused, UsageError
+from ident_service.errors import DiskFull, DriverError, IdentError, MotionRefused, UsageError
 from ident_service.motion.command_channel import stop_requested_ns
 from ident_service.operations.moving_arms import Asked, ask_arm, moving_arms, stop_arms
 from ident_service.registry import jobs as rows
@@ -536,7 +536,7 @@ class Engine:
         reached, failures = stop_arms(self.state, arm)
         self.audit.note(by, "stop", arm or "all arms", reached=reached, jobs=ended)
         for failure in failures:
-            raise failure
+            raise DriverError(f"{failure}; stopped: {', '.join(reached) or 'no other arm'}")
         return {"arms": reached, "jobs": ended}
 
     def ask(self, arm: str, request: Asked, by: str) -> bool:
