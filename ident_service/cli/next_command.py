@@ -117,9 +117,9 @@ def next_after_error(arguments: argparse.Namespace, kind: type[IdentError], mess
     if arguments.word in _WITHOUT_ARM:
         return ""
     words = ["recover", str(arm)]
-    if arguments.word == "reidentify" and not issubclass(kind, ArmFault):
-        words = ["reidentify", str(arm)]  # it makes its own preflight
-    elif "preflight" in message and not issubclass(kind, ArmFault):
+    if "preflight" in message and not issubclass(kind, ArmFault):
+        if arguments.word == "reidentify":  # which makes its own
+            return f"next: {shell_line(arguments, ['reidentify', str(arm)])}\n"
         slow = arguments.word in ("home", "recover")
         words = ["preflight", str(arm), *(["--home"] if slow else Ended(arguments, 0, {}, "").motion)]
     return f"next: {shell_line(arguments, words)}\n"

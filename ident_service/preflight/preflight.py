@@ -291,7 +291,9 @@ class _Preflight:
             self._passed(impossible, of_place=True)
             return False
         refused = consent_check(self.model, looked.samples[-1], self.confirm)
-        return refused is None or self._passed(refused)
+        if refused is not None:
+            self._passed(refused)
+        return refused is None
 
     def _planned(self, session: Session) -> list[TestMotion]:
         """Plan a small test motion of every joint; none, and a failed check, where a joint has no room."""

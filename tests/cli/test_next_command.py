@@ -136,6 +136,7 @@ ERRORS: list[tuple[str, IdentError, str]] = [
     ("watch my.yaml", PositionUnknown("not zeroed"), "next: ident set-home my.yaml\n"),
     ("reidentify planar2", UsageError("planar2: nothing has been accepted yet"), "next: ident preflight planar2\n"),
     ("reidentify planar2", PersonNeeded("not allowed to move by its preflight"), "next: ident reidentify planar2\n"),
+    ("reidentify planar2", PersonNeeded("unacknowledged faults: overspeed"), "next: ident recover planar2\n"),
 ]
 
 

@@ -88,7 +88,7 @@ def test_a_person_is_asked_by_the_arms_name_before_anything_is_energised(good: F
     [("", "nobody typed the arm's name, bench,"), ("yes", "'yes' is not the arm's name, bench,")],
 )
 def test_without_the_name_nothing_is_energised(typed: str, why: str) -> None:
-    """Who does not confirm that nobody is within reach may have somebody there."""
+    """A person who is near the arm would not type its name either."""
     flight = Flight(typed=typed)
     ticket = flight.ticket()
     assert ticket.verdict is Verdict.NEEDS_PERSON

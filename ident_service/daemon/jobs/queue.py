@@ -533,8 +533,11 @@ class Engine:
             DriverError: the control file of an arm cannot be opened, which may move; all others have been reached.
         """
         ended = self.live.stop(arm, f"{by} asked for a stop")
-        reached, failures = stop_arms(self.state, arm)
-        self.audit.note(by, "stop", arm or "all arms", reached=reached, jobs=ended)
+        reached, failures = list[str](), list[DriverError]()
+        try:
+            reached, failures = stop_arms(self.state, arm)
+        finally:
+            self.audit.note(by, "stop", arm or "all arms", reached=reached, jobs=ended)
         for failure in failures:
             raise DriverError(f"{failure}; stopped: {', '.join(reached) or 'no other arm'}")
         return {"arms": reached, "jobs": ended}
