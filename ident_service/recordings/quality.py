@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 
 SATURATED: Final = 0.999  # of the limit
 PLATEAU: Final = 5  # so many samples in a row exactly at the extreme value look like a limit where none is known
+# Read in whole steps, a wave that turns round in its largest step is in the step below for at least 0.41 of that time;
+# one that is cut off three steps or more below its top, for at most 0.15.
+_BELOW_A_PLATEAU: Final = 0.15
 STANDSTILL: Final = 0.005  # [rad/s or m/s]
 STANDSTILL_OVER: Final = 0.02  # [s]
 MUCH_JITTER: Final = 0.05  # of a period, standard deviation
@@ -62,7 +65,7 @@ class JointQuality:
         name: name of the joint, or its number from 1.
         saturated: share of samples at the torque limit, or, where that is more, `clipped`.
         clipped: share of samples that sit exactly at the extreme torque five times in a row or more while the joint
-            moves.
+            moves; 0 where a wave that turns round in coarse steps of torque does so too.
         standstill: share of the time that the joint is slower than 0.005 rad/s or m/s over 20 ms.
         position: smallest and largest [rad or m].
         position_at: times of these positions [s after the first sample].
@@ -220,7 +223,7 @@ class _Joints:
         self._position = (np.full(joints, np.inf), np.full(joints, -np.inf))
         self._position_at = np.zeros((2, joints))
         self._torque = (np.full(joints, np.inf), np.full(joints, -np.inf))
-        self._step = np.full(joints, np.inf)
+        self._step, self._torque_step = np.full(joints, np.inf), np.full(joints, np.inf)
         self._largest, self._squares = np.zeros((3, joints)), np.zeros(joints)
         self._steps = 0
         self._at_limit = np.zeros(joints)
@@ -257,6 +260,9 @@ class _Joints:
         self._pairs += int(whole.sum())
         moves = np.zeros(torque.shape, np.bool_)
         moves[len(moves) - len(whole) :] = whole[:, None] & (speed >= STANDSTILL)
+        changes = np.abs(np.diff(run.torque[max(0, fresh - 1) :], axis=0))
+        changed = np.where(changes > 0.0, changes, np.inf)
+        self._torque_step = np.minimum(self._torque_step, changed.min(axis=0, initial=np.inf))
         for joint, (top, bottom) in enumerate(self._plateaus):
             top.add(torque[:, joint], moves[:, joint])
             bottom.add(-torque[:, joint], moves[:, joint])
@@ -295,7 +301,7 @@ class _Joints:
         found = []
         for k, name in enumerate(self._names):
             varies = self._torque[0][k] < self._torque[1][k]
-            clipped = sum(side.samples() for side in self._plateaus[k]) if varies else 0
+            clipped = sum(side.samples(self._torque_step[k]) for side in self._plateaus[k]) if varies else 0
             found.append(
                 JointQuality(
                     name=name,
@@ -322,18 +328,25 @@ def _wider(extremes: tuple[Array, Array], values: Matrix) -> tuple[Array, Array]
 
 
 class _Plateau:
-    """Count the samples in long runs at the largest value seen so far."""
+    """Count the samples in long runs at the largest value seen so far, and those at the next smaller value."""
 
     def __init__(self) -> None:
-        self._value = -np.inf
+        self._value, self._below = -np.inf, -np.inf
+        self._at_value, self._at_below = 0, 0  # samples
         self._counted = 0
         self._run = 0  # samples at the value at the end of what was seen
 
     def add(self, values: Array, counts: NDArray[np.bool_]) -> None:
         """Add the next samples, and which of them count, shapes (samples,)."""
         if (largest := float(values.max())) > self._value:
-            self._value, self._counted, self._run = largest, 0, 0
+            self._below, self._at_below = self._value, self._at_value
+            self._value, self._at_value = largest, 0
+            self._counted, self._run = 0, 0
+        if (below := float(values[values < self._value].max(initial=-np.inf))) > self._below:
+            self._below, self._at_below = below, 0
+        self._at_below += int(counts[values == self._below].sum())
         at_value = np.concatenate([[False], (values == self._value) & counts, [False]])
+        self._at_value += int(at_value.sum())
         edges = np.flatnonzero(np.diff(at_value))
         begins, lengths = edges[::2], edges[1::2] - edges[::2]
         if len(begins) and begins[0] == 0:
@@ -345,9 +358,11 @@ class _Plateau:
         self._counted += int(closed[closed >= PLATEAU].sum())
         self._run = int(lengths[-1]) if open_end else 0
 
-    def samples(self) -> int:
-        """Return the number of samples in runs of at least `PLATEAU`."""
-        return self._counted + (self._run if self._run >= PLATEAU else 0)
+    def samples(self, step: float) -> int:
+        """Return the number of samples in runs of at least `PLATEAU`; 0 for the top of a wave in such coarse steps."""
+        found = self._counted + (self._run if self._run >= PLATEAU else 0)
+        one_below = self._at_below if self._value - self._below < 1.5 * step else 0
+        return found if one_below <= _BELOW_A_PLATEAU * found else 0
 
 
 class _Rests:

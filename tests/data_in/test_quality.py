@@ -74,14 +74,27 @@ def test_saturation(samples: int, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_touch_of_the_extreme_is_no_saturation() -> None:
     torque = np.zeros((1000, 1))
+    torque[::2] -= 0.5
     torque[100:104] = 1.0
     torque[500:504] = 1.0
-    torque[::2] -= 0.5
     recording = MadeRecording(MILLISECONDS[:1000], np.arange(1000.0)[:, None], torque)
     assert quality(recording, PLAIN).joints[0].saturated == 0.0
     torque[700:705] = 1.0
     recording = MadeRecording(MILLISECONDS[:1000], np.arange(1000.0)[:, None], torque)
     assert quality(recording, PLAIN).joints[0].saturated == pytest.approx(0.005)
+
+
+@pytest.mark.parametrize("step", [1e-4, 0.1, 0.5])
+@pytest.mark.parametrize("seconds", [3.0, 10.0])
+def test_the_round_top_of_a_slow_wave_in_coarse_steps_is_no_saturation(step: float, seconds: float) -> None:
+    """Torque is counted in whole steps: a wave stays in its top step for a while, one cut at 80 % for longer."""
+    wave = 20.0 * np.sin(2 * np.pi * MILLISECONDS * 1e-9 / seconds) + 3.0 * np.sin(5 * MILLISECONDS * 1e-9)
+    top = 0.8 * wave.max()
+    torque = np.round(np.column_stack([wave, np.minimum(wave, top)]) / step) * step
+    position = np.column_stack([np.arange(10_000) * 1e-3] * 2)
+    whole, cut = quality(MadeRecording(MILLISECONDS, position, torque), PLAIN).joints
+    assert whole.saturated == 0.0
+    assert cut.saturated == pytest.approx(float((torque[:, 1] == torque[:, 1].max()).mean()), rel=0.2)
 
 
 @pytest.mark.slow
