@@ -51,10 +51,9 @@ class KnownArm:
 
 
 def resources(config: ArmConfig) -> tuple[str, ...]:
-    """Return the names of what a motion takes for itself: the arm, and its `driver.buses` but those in lock step."""
-    buses = getattr(config.driver, "buses", ())
+    """Return the names of what a motion takes for itself: the arm, and its CAN buses but those in lock step."""
     # A bus in lock step is not shared: it is within one process.
-    wires = {f"bus {bus.interface} {bus.channel}" for bus in buses if bus.interface != "lock_step"}
+    wires = {f"bus {bus.interface} {bus.channel}" for bus in config.can_buses if bus.interface != "lock_step"}
     return (f"arm {config.name}", *sorted(wires))
 
 

@@ -12,6 +12,7 @@ from daemon.conftest import Asked, quick_text, serving
 from daemon.test_access_control import refusal
 from daemon.verbs_bench import ON_A_BUS, answered, on_a_bus, singular_copy, unstable_text, with_arms, with_run
 
+from ident_service.config.load import load_arm
 from ident_service.daemon.jobs.commands import command_of_request
 from ident_service.daemon.jobs.requests import BusScan, Zero
 from ident_service.daemon.request_guard import MOST_UPLOAD
@@ -126,6 +127,12 @@ def test_buses_and_descriptions(daemon: Asked, state: Path) -> None:
     order = command_of_request(daemon.service.db, state, BusScan(kind="bus_scan", arm=ON_A_BUS))
     assert order.resources == resources(arm.config) == (f"arm {ON_A_BUS}",)
     assert not order.moves
+
+
+@pytest.mark.parametrize("name", ["wam7_pucks", "wam7_canopen"])
+def test_two_arms_on_one_bus_move_one_after_the_other(name: str) -> None:
+    config = load_arm(name)
+    assert resources(config) == (f"arm {name}", "bus socketcan can0")
 
 
 def test_a_description_is_judged_and_not_kept(daemon: Asked, state: Path) -> None:
