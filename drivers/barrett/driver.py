@@ -101,7 +101,7 @@ class JointEncoders:
         self._without = dict.fromkeys(self._radians, 0)
 
     def update(self, pucks: Sequence[MotorPuck], position: Vector) -> tuple[Vector | None, list[AxisEvent]]:
-        """Return joint positions by the encoders [rad], and events of joints newly off their motors or unread.
+        """Return joint encoders' positions [rad], None without any; events of joints newly off their motors or unread.
 
         Args:
             pucks: pucks at the end of a cycle.

@@ -267,7 +267,7 @@ def get_frame(destination: int, property_number: int, *, group: bool = False) ->
 
 
 def set_frame(destination: int, property_number: int, value: int, *, group: bool = False, sender: int = HOST) -> Frame:
-    """Return the frame that sets a property: 6 bytes for a value of any size, as libbarrett and OWD send.
+    """Return the frame that sets a property, always of 6 bytes, as libbarrett and OWD send; DriverError beyond 32 bits.
 
     Raises:
         DriverError: a value that 32 bits do not hold.

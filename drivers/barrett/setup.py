@@ -111,7 +111,7 @@ class PropertyPort:
             raise DriverError(f"puck {node}: {property_name} is {found} after {value} was written")
 
     def positions(self, properties: Properties, nodes: Iterable[int]) -> dict[int, int]:
-        """Request the positions of the whole arm with one frame; return those that come in time [counts], by node."""
+        """Request all pucks' positions with one frame; return those of `nodes` that come in time [counts], by node."""
         self.link.send(get_frame(Group.ARM, properties.number("P"), group=True))
         wanted, found = set(nodes), dict[int, int]()
         until_ns = self.clock.now_ns() + round(TIMEOUT * 1e9)
@@ -207,7 +207,7 @@ class FoundArm:
 
 
 def read_pucks(port: PropertyPort, driver: BarrettDriver, *, wakes: bool = True) -> FoundArm:
-    """Read version, role and settings of every puck of an arm, after waking those asleep if `wakes`.
+    """Read version, role and settings of an arm's pucks, after waking those asleep; PositionUnknown unless `wakes`.
 
     Args:
         port: port to the bus.

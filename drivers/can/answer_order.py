@@ -72,7 +72,7 @@ class AnswerOrder:
         self.behind = max(0, self.behind - 1)
 
     def believe_uncertain(self) -> bool:
-        """Return at a cycle's end whether an uncertain answer counts as the latest request's: the first two do."""
+        """Settle an uncertain answer at a cycle's end; return if it counts as the latest's: at most two in a row do."""
         self.uncertain = False
         self._doubted += 1
         return self._doubted <= _BELIEVED

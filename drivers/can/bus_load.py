@@ -44,7 +44,7 @@ class Bits(NamedTuple):
     data: int = 0
 
     def seconds(self, bitrate: int, data_bitrate: int | None = None) -> float:
-        """Return how long the bits last at these bit rates [s]; rates in [bit/s]."""
+        """Return how long the bits last [s] at these rates [bit/s]; data bits count only with a `data_bitrate`."""
         return self.nominal / bitrate + (self.data / data_bitrate if data_bitrate is not None else 0.0)
 
 
@@ -57,7 +57,7 @@ def padded_length(least_length: int) -> int:
 
 
 def unstuffed_bits(data_length: int, *, fd: bool = False) -> Bits:
-    """Return the bits of an 11-bit identifier's data frame without stuffing; ValueError for a length no frame has."""
+    """Return the number of bits of an 11-bit identifier's data frame, unstuffed; ValueError for a wrong length."""
     if not fd:
         return Bits(_classical(data_length) + _TAIL)
     return Bits(
@@ -66,7 +66,7 @@ def unstuffed_bits(data_length: int, *, fd: bool = False) -> Bits:
 
 
 def most_bits(data_length: int, *, fd: bool = False) -> Bits:
-    """Return the most bits of an 11-bit identifier's data frame with so many bytes; ValueError for a wrong length."""
+    """Return the largest number of bits of an 11-bit identifier's data frame; ValueError for a wrong length."""
     plain = unstuffed_bits(data_length, fd=fd)
     if not fd:
         return Bits(plain.nominal + (_classical(data_length) - 1) // 4)
@@ -76,7 +76,7 @@ def most_bits(data_length: int, *, fd: bool = False) -> Bits:
 
 
 def exact_bits(frame: Frame, *, fd: bool = False) -> Bits:
-    """Return the bits of one frame with this content; raises ValueError for a length no frame has.
+    """Return the number of bits of one frame with this content; raises ValueError for a length no frame has.
 
     Error frames are the controller's and not on the wire: 0 bits. Remote frames count as asking for no data.
     """
@@ -322,7 +322,7 @@ def line_of(
     *,
     cyclic: bool = False,
 ) -> Line:
-    """Return the line of the frames of one sort: identifiers, length, rate, and the mean cost of one on the bus.
+    """Return the line of frames of one sort: identifiers, length, rate of each, and the mean cost of one on the bus.
 
     Args:
         name: name of the sort of frames.

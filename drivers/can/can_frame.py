@@ -94,7 +94,7 @@ def to_kernel(frame: Frame, *, fd: bool = False) -> bytes:
 
 
 def from_kernel(data: bytes, stamp_ns: int = 0) -> Frame:
-    """Return the frame that was read from a socket as bytes.
+    """Return the frame that was read from a socket as bytes; DriverError for bytes that are none.
 
     Raises:
         DriverError: bytes that are neither of the two structures, or a length that exceeds the structure's.
@@ -131,7 +131,7 @@ def pack_frames(frames: Iterable[tuple[Frame, bool]]) -> bytes:
 
 
 def unpack_frames(data: bytes) -> list[tuple[Frame, bool]]:
-    """Unpack the frames of one packet, each with whether the recipient of the packet sent it.
+    """Unpack the frames of one packet, each with whether the packet's recipient sent it; DriverError for a bad packet.
 
     Raises:
         DriverError: a packet that is empty, too long, torn, or has a frame that cannot exist.

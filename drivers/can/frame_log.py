@@ -53,7 +53,7 @@ def require_format(path: Path | str) -> Path:
 
 
 def logged_links(links: Sequence[Link], log_file: Path, fd: Sequence[bool]) -> tuple[SessionLog, list[Link]]:
-    """Wrap links to log to a new file; return its log, to be closed last, and them; failing closes them.
+    """Wrap links to log frames to a new file; return the log, to be closed last, and these; an error closes `links`.
 
     Args:
         links: of all buses.

@@ -84,7 +84,7 @@ class OrderedLog:
         self.written = 0
 
     def add(self, bus: int, frames: list[tuple[Frame, bool]]) -> None:
-        """Add frames of one bus, and write, in the order of their stamps, all that are older than a fixed time."""
+        """Add frames of one bus; write, in the order of stamps, all that are a fixed time older than the newest."""
         for frame, sent in frames:
             heapq.heappush(self._heap, (frame.stamp_ns, next(self._numbers), frame, bus, sent))
         newest = max(frame.stamp_ns for frame, _ in frames)
@@ -107,7 +107,7 @@ class OrderedLog:
 
 
 def main() -> int:
-    """Write one log of the frame packets on standard input; return 0 when all of them are in it, 1 after an error."""
+    """Write one log of the frame packets from the socket on standard input; return 0 when all are in it, else 1."""
     _step_back()
     with socket.socket(fileno=sys.stdin.fileno()) as source:
         return _serve(source)

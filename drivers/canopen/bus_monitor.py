@@ -216,7 +216,7 @@ class MonitoringArm(Arm):
         raise DriverError("a read-only arm cannot be reset")
 
     def exchange(self, torque: Vector | None) -> Sample:
-        """Wait for the next cycle, ask every drive for position, status and errors, and return the sample; no torque.
+        """Wait for a cycle, ask every drive for position, status, errors, return the sample; DriverError for a torque.
 
         Raises:
             DriverError: not open, a torque, a bus is gone, or another host has begun to stream: it must not be delayed.

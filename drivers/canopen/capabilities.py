@@ -41,7 +41,7 @@ def shipped_families() -> tuple[Family, ...]:
 
 
 def family_of(identity: Mapping[str, int], own_families: Sequence[Family] = ()) -> Family:
-    """Return the family of a drive by vendor and product, or the generic one, which also fills what it leaves open.
+    """Return a drive's family by vendor and product, its gaps filled from the generic one; else the generic one.
 
     Args:
         identity: values of 1018h, by the keys `vendor` and `product`.
@@ -192,7 +192,7 @@ class Capabilities:
 
     @property
     def summary(self) -> str:
-        """Describe in one line the drive's family, torque mode, count, limits, watchdogs and status reports."""
+        """Describe in one line the drive's family, torque mode and unit, limits, watchdogs and status reports."""
         unknown = "unknown"
         torque = unknown if self.torque is None else f"mode {self.torque.mode} by {readable_entry(self.torque.target)}"
         count = unknown if self.count is None else f"{self.count:.6g} N m"

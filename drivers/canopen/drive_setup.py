@@ -250,7 +250,7 @@ class DriveConfiguration:
 
     @property
     def limit_counts(self) -> int:
-        """Return the largest torque that the drive may give [per mille of rated torque].
+        """Return the drive's torque limit [per mille of rated]; with positions streamed the joint's limit counts, too.
 
         Where positions are streamed the drive alone can keep the joints' limits; else the host does, cycle by cycle.
         """
@@ -503,7 +503,7 @@ class LeftDrive:
 def disable_supervision(
     objects: Objects, zeros: Zeros | None, drive_index: int, restarted: Callable[[], bool]
 ) -> LeftDrive:
-    """End a drive's supervision of its host unless it has power; return its state, and whether it may still react.
+    """End a drive's supervision of its host unless it has power; return its state, and if a lost host may fault it.
 
     A zero that the drive has confirmed it confirms afterwards too, and nothing else: one that restarted in the session
     has lost its zero. A part that it refuses does not keep it from the others.

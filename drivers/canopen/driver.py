@@ -187,7 +187,7 @@ class MeasuredTorque:
         self.difference: Vector | None = None
 
     def update(self, torque_counts: Sequence[int], drives: Sequence[Drive]) -> None:
-        """Update measured torque and its difference from the torques sent and the reports received in a cycle.
+        """Take a cycle's sent torques and drives' reports; update measured torque and its excess over what was sent.
 
         Args:
             torque_counts: sent with its SYNC [per mille of rated torque], by drive.
@@ -435,7 +435,7 @@ class CanopenArm(Arm):
         return budget(self._driver, self._config.control.rate if rate is None else rate)
 
     def setup_checks(self) -> tuple[SetupCheck, ...]:
-        """Return a failed check per controller that error frames call error-passive or bus-off; else empty."""
+        """Return a failed check per host controller that is error-passive or bus-off; DriverError while not open."""
         codecs = self._open().codecs
         return tuple(one for codec in codecs for one in controller_checks(codec.profile.bus.channel, codec.controller))
 

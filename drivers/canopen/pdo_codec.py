@@ -236,7 +236,7 @@ class BusCodec:
         self._ours |= {frame.cob_id for frame in profile.torque_frames}
 
     def torque_frames(self, target_counts: Sequence[int]) -> list[Frame]:
-        """Return the frames that carry a torque, or a position, to every drive of this bus.
+        """Return frames with this bus's torques, or positions, out of the whole arm's; DriverError for one too big.
 
         Args:
             target_counts: torques of all drives of the arm [per mille of rated torque, or counts], in the arm's order.

@@ -51,7 +51,7 @@ class WriteNotVerified(DriverError):
 
 
 def none_if_missing(read: Callable[[Any], T], argument: Any) -> T | None:
-    """Return `do(what)`; None where it raises SdoRefused because the drive has no such entry."""
+    """Return `read(argument)`; None where it raises SdoRefused because the drive has no such entry."""
     try:
         return read(argument)
     except SdoRefused as refused:
@@ -282,7 +282,7 @@ def poll(
     deadline_ns: int,
     on_other_frame: Callable[[int, Frame], None] = lambda bus, frame: None,
 ) -> Answers:
-    """Ask nodes for one entry by SDO, in bursts until a deadline; return the values and aborts that came.
+    """Ask nodes once for one entry by SDO, in bursts until a deadline; return the values and aborts that came.
 
     Args:
         links: of the arm's buses.

@@ -158,7 +158,7 @@ class Buses:
             link.send(codec.control_download(drive.node, word))
 
     def request_upload(self, drive_index: int, entry: Entry) -> None:
-        """Send the upload of an entry of up to four bytes; the answer comes with a later cycle (`Drive.uploads`)."""
+        """Request an entry of up to four bytes by SDO; the answer comes with a later cycle (`Drive.uploads`)."""
         codec, link = self._at[drive_index]
         codec.asked.add(entry.key)
         link.send(Frame(SDO_REQUEST + self.drives[drive_index].node, upload_request(entry)))

@@ -52,7 +52,7 @@ class ArmShown:
 
 
 def arm_page(folder: Path, shown: ArmShown) -> str:
-    """Return the HTML page of one arm of a fleet, from its result files and what the fleet found of it.
+    """Return the HTML page of one arm of a fleet, from the arm's result folder and what the fleet found of it.
 
     Args:
         folder: folder with the arm's files and its evidence.

@@ -70,7 +70,7 @@ from ident_service.results.manifest import replacing_folder, require_writable_pl
 def identify_fleet(
     request: FleetRequest, folder: Path, tell: Tell = lambda _: None, step: Step = lambda words, share: None
 ) -> FleetResult:
-    """Identify every arm of a fleet and write the results, which replace an earlier result in the folder.
+    """Identify a fleet's arms, write the results over earlier ones; UsageError if the folder holds anything else.
 
     Args:
         request: recordings, description and options.

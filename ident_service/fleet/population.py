@@ -104,13 +104,13 @@ class ArmFit:
         precision = fit.R1.T @ fit.R1 / (max(variance, np.finfo(float).tiny) * doubt.inflation)
         return cls(fit, doubt, clusters, precision, total, error)
 
-    def weighed(self, between_variance: Array) -> ArmFit:
-        """Return a copy with its precision lowered by the variance of the arm's mean between recordings.
+    def weighed(self, variance_of_mean: Array) -> ArmFit:
+        """Return a copy with precision lowered by the variance of the arm's mean from differences between recordings.
 
         Args:
-            between_variance: variance of the arm's mean by that [SI^2], shape (base,).
+            variance_of_mean: variance between recordings divided by their number [SI^2], shape (base,).
         """
-        return replace(self, precision=_widened(self.precision, between_variance))
+        return replace(self, precision=_widened(self.precision, variance_of_mean))
 
     @property
     def right(self) -> Array:

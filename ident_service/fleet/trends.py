@@ -302,7 +302,7 @@ def _carried(recordings: Sequence[Recorded]) -> Array:
 def dependences(
     arms: Mapping[str, Sequence[Recorded]], groups: Mapping[Group, Sequence[int]], scatter: Mapping[Group, Scatter]
 ) -> list[Dependence]:
-    """Regress every base parameter on each recorded condition, with a level per arm; return slopes with p-values."""
+    """Regress base parameters on each recorded condition, with a level per arm; return slopes, p Holm-corrected."""
     every = []
     for name in CONDITIONS.values():
         carrying = {arm: [one for one in recordings if name in one.row.conditions] for arm, recordings in arms.items()}
@@ -357,7 +357,7 @@ class Compared:
 def compare_arms(
     arms: Mapping[str, Sequence[Recorded]], fits: Mapping[str, ArmFit], common_model: Population, described: Described
 ) -> Compared:
-    """Test every arm of a fleet against the others and over time; return all tests with the scatter.
+    """Test arms against each other and over time, parameters against conditions; return all tests and the scatter.
 
     Args:
         arms: recordings of each arm, by time.
@@ -379,7 +379,7 @@ def compare_arms(
 def parameter_series(
     recordings: Sequence[Recorded], base_index: int, group_index: int, index_in_group: int, scatter: Scatter
 ) -> Array:
-    """Return one parameter of one arm over time: rows of time [s since 1970], value, half its 95 % interval [SI].
+    """Return a parameter over time, per recording that saw it: time [s since 1970], value, half its 95 % interval [SI].
 
     Args:
         recordings: of the arm, by time.
