@@ -1,4 +1,4 @@
-"""Describe CANopen drives (CiA 301, CiA 402) on one or two buses, and how each stops when its host is gone.
+"""Describe CANopen drives (CiA 301, CiA 402) on one to four buses, and how each stops when its host is gone.
 
 Frames and their cost on the wire are `drivers/canopen`, gears and couplings the section `transmission` of the arm,
 whose motors are the drives here, in this order.
