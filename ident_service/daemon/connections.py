@@ -103,7 +103,7 @@ class Connections:
         return len(self._open)
 
     def admit(self, connection: Connection) -> bool:
-        """Admit a new connection, closing, if need be, one that has long waited for a request; False if none waits."""
+        """Admit a new connection, if full in place of the one that waits longest for a request; False if none does."""
         host = connection.peer[0]
         if self._of_one[host] >= self._most_of_one:
             longest = next((peer for peer in self._waiting if peer[0] == host), None)
@@ -227,7 +227,7 @@ class Listener(socket.socket):
         self._book, self._accepted, self._gone = book, 0, 0
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """Return (socket, address) of the next admitted connection, closing refused ones; BlockingIOError if none now.
+        """Return (socket, address) of the next admitted connection, closing others; BlockingIOError if none or enough.
 
         Raises:
             BlockingIOError: nobody waits, or it is somebody else's turn in the event loop.
