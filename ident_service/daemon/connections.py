@@ -135,7 +135,7 @@ class Connections:
             self._waiting.pop(peer, None)
 
     def answering_stranger(self, peer: Peer | None) -> None:
-        """Note that an answer to a client without a token begins; its deadline to read all of it begins."""
+        """Note that an answer to a client without a token begins: it has a deadline, and gives way to newcomers."""
         if peer in self._open:
             self._waiting.pop(peer, None)
             self._waiting[peer] = self._now() + ANSWER_SECONDS
