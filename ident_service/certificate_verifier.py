@@ -381,7 +381,7 @@ class ExactBlock:
         return is_positive_definite(symmetric(entries, self.size))
 
 
-def set_blocks(kind: Kind, link: int) -> ExactBlock:
+def link_condition(kind: Kind, link: int) -> ExactBlock:
     """Build the matrix of one link that must be positive definite: eq. 17 for `inertia`, else the pseudo-inertia.
 
     It is written down here a second time, from the formulas, so that a proof does not rest on the solver's arrays.
@@ -658,7 +658,7 @@ def read_claim(document: dict[str, object], certificate: dict[str, object]) -> C
         raise VerificationError(f"base_parameters: {len(K)} expressions but {len(beta)} values")
     links = tuple(sorted({_link(number) for number in _as_list(certificate.get("links"), "certificate.links")}))
     name_of_set: Kind = "inertia" if kind == "inertia" else "pseudo_inertia"
-    own = tuple(set_blocks(name_of_set, link) for link in links)
+    own = tuple(link_condition(name_of_set, link) for link in links)
     listed = _blocks(certificate.get("blocks"), "certificate.blocks")
     equalities = _blocks(certificate.get("equalities"), "certificate.equalities")
     conditions = (*own, *listed, *equalities)
@@ -1301,7 +1301,7 @@ def answer_text(path: Path, answer: Verification) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Check the file or folder on the command line, print the verdict; return 0 feasible, 2 no parameter file, 3 else.
+    """Check the given file or folder, print the verdict; return 0 feasible, 2 no readable parameter file, 3 otherwise.
 
     Returns:
         0: consistent with its own conditions, and these can be met. 3: not so. 2: the file cannot be read, or is

@@ -92,7 +92,7 @@ class Authenticator:
         self._tokens, self._sessions = digests(self._db), sessions(self._db)
 
     def known(self, token: str | None, session: str | None) -> Access | None:
-        """Return name and role of a token, or else a session's secret, by the copy in memory; None if it is not valid.
+        """Return the caller's name and role by the copy in memory: by token or, without one, by session; else None.
 
         A token that was revoked at a terminal counts here until the next `refresh`, which each request brings about.
         """
@@ -103,7 +103,7 @@ class Authenticator:
         return None if key is None else self._tokens.get(key)
 
     def by_token(self, token: str, address: str) -> Access | None:
-        """Return a token's name and role by the registry; None, a failed attempt, if unknown; Throttled after too many.
+        """Return a token's name and role by the registry; if unknown, count a failure, None; Throttled after too many.
 
         Raises:
             Throttled: too many failed attempts; a token that was good from this address before is still heard.

@@ -103,7 +103,7 @@ class Connections:
         return len(self._open)
 
     def admit(self, connection: Connection) -> bool:
-        """Admit a new connection, closing, if need be, one that has long waited for a request; False if none waits."""
+        """Admit a new connection, if full in place of the one that waits longest for a request; False if none does."""
         host = connection.peer[0]
         if self._of_one[host] >= self._most_of_one:
             longest = next((peer for peer in self._waiting if peer[0] == host), None)
@@ -135,7 +135,7 @@ class Connections:
             self._waiting.pop(peer, None)
 
     def answering_stranger(self, peer: Peer | None) -> None:
-        """Note that an answer to a client without a token begins; its deadline to read all of it begins."""
+        """Note that an answer to a client without a token begins: it has a deadline, and gives way to newcomers."""
         if peer in self._open:
             self._waiting.pop(peer, None)
             self._waiting[peer] = self._now() + ANSWER_SECONDS
@@ -227,7 +227,7 @@ class Listener(socket.socket):
         self._book, self._accepted, self._gone = book, 0, 0
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """Return (socket, address) of the next admitted connection, closing refused ones; BlockingIOError if none now.
+        """Return (socket, address) of the next admitted connection, closing others; BlockingIOError if none or enough.
 
         Raises:
             BlockingIOError: nobody waits, or it is somebody else's turn in the event loop.

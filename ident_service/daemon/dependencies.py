@@ -119,7 +119,7 @@ async def operator(found: Annotated[Access, Depends(viewer)]) -> Access:
 
 
 async def local_or_authenticated(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> str:
-    """Return a stop's caller by token or session, or `anybody` if the service listens at loopback only; 401 for others.
+    """Return the name of a stop's caller; without valid token or session `anybody` at loopback, elsewhere raise 401.
 
     A stop does no harm, and whoever needs it may have no token at hand, or one that is out of date, or be throttled.
     From another machine it takes a token of any role, so that strangers on a network cannot keep an arm from working.

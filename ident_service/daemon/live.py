@@ -217,24 +217,24 @@ class LiveRuns:
     def __init__(self) -> None:
         self._lock, self._runs = threading.Lock(), OrderedDict[str, LiveRun]()
 
-    def run(self, run_id: str, folder: Path) -> LiveRun:
-        """Return the live view of the run of this id, made if new; the longest unused ones are closed if too many."""
+    def run(self, job: str, folder: Path) -> LiveRun:
+        """Return the live view of the run that a job records, made if new; the longest unused close if too many."""
         with self._lock:
-            found = self._runs.setdefault(run_id, LiveRun(folder))
-            self._runs.move_to_end(run_id)
+            found = self._runs.setdefault(job, LiveRun(folder))
+            self._runs.move_to_end(job)
             while len(self._runs) > _MOST_RUNS:
                 self._runs.popitem(last=False)[1].close()
         return found
 
     def close(self) -> None:
         """Close all runs."""
-        for name in list(self._runs):
-            self.forget(name)
+        for job in list(self._runs):
+            self.forget(job)
 
-    def forget(self, run_id: str) -> None:
-        """Close and remove a run that has ended."""
+    def forget(self, job: str) -> None:
+        """Close and remove the live view of a job's run, if there is one."""
         with self._lock:
-            found = self._runs.pop(run_id, None)
+            found = self._runs.pop(job, None)
         if found is not None:
             found.close()
 

@@ -38,7 +38,7 @@ def _shown(service: Service, row: Row) -> str:
 
 
 async def live_events(service: Service, live: LiveRuns, row: Row) -> AsyncIterator[str]:
-    """Yield server-sent events until the job ends: `job` on changes; `samples` and `doubt` of a recorded run."""
+    """Yield server-sent events until the job ends: `job` on changes, `samples` of a run or watch, `doubt` of a run."""
     run = None
     if row["kind"] in RECORDED and row["run"] is not None and row["state"] in rows.LIVE:
         run = live.run(row["id"], service.state / RUNS / str(row["run"]))

@@ -89,9 +89,9 @@ class Metrics:
         if ran_seconds is not None:
             self._job.labels(kind, state).observe(ran_seconds)
 
-    def add_lateness(self, ended_document: Any) -> None:
-        """Add the lateness histogram of a run, from its `ended.json`; a document of another form is left out."""
-        self._lateness.add(ended_document)
+    def add_lateness(self, histogram: Any) -> None:
+        """Add a run's lateness histogram, `lateness` of its `ended.json`; one of another form is left out."""
+        self._lateness.add(histogram)
 
     def text(
         self, jobs: Mapping[tuple[str, str], int], moving: Iterable[str], faults: Sizes, due: Sizes, alarms: Sizes

@@ -154,7 +154,7 @@ class QueuedHandler(logging.Handler):
 
 
 def log_as_json() -> None:
-    """Log to stderr as JSON lines from now on, but floods of alike lines and uvicorn's access log."""
+    """Log to stderr as JSON lines from now on, except floods of alike lines and uvicorn's access log."""
     handler = QueuedHandler(sys.stderr)
     handler.setFormatter(JsonLines())
     handler.addFilter(RepeatFilter())

@@ -148,7 +148,7 @@ class Upload:
 
 
 def begin_upload(db: Database, state: Path, announced: Announced) -> Upload:
-    """Begin an upload in a folder, or resume the same person's; return it with the bytes there, or its run.
+    """Begin an upload, or resume the same person's; return it with the bytes received so far, or the run it has become.
 
     Args:
         db: the registry.
@@ -298,7 +298,7 @@ class Piece:
             raise
 
     def write(self, data: bytes) -> None:
-        """Append bytes to the upload's file; raise UsageError if that is then larger than announced.
+        """Append bytes to the upload's file; write none and raise UsageError if it would be larger than announced.
 
         Raises:
             UsageError: they are more than were announced; `withdraw` is to follow.

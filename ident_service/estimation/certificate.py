@@ -40,8 +40,8 @@ from ident_service.certificate_verifier import (
     ExactBlock,
     VerificationError,
     is_positive_semidefinite,
+    link_condition,
     rational_text,
-    set_blocks,
     symmetric,
     triangle,
     verify,
@@ -616,7 +616,7 @@ def _links(names: Iterable[str]) -> list[int]:
 
 
 def _implied(conditions: FeasibleSet) -> list[ExactBlock]:
-    return [set_blocks(conditions.kind, link) for link in _links(conditions.names)]
+    return [link_condition(conditions.kind, link) for link in _links(conditions.names)]
 
 
 def _witness(statement: Statement, conditions: FeasibleSet, delta: Array) -> dict[str, Any] | None:

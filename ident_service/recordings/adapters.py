@@ -67,7 +67,7 @@ class RangeRecording:
         self.payload = payload_of(self.whole)
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
-        """Yield the samples in the range, in blocks; RecordingError if there are none, or its end is beyond the file's.
+        """Yield the samples in the range, in blocks; RecordingError if none, or if a labelled one ends past the file.
 
         Raises:
             RecordingError: no sample lies in the range; and whatever the whole recording's blocks raise.
@@ -175,7 +175,7 @@ def without_standstill(recording: Recording, kept_seconds: float) -> RangeRecord
 
 
 def without_ends(recording: Recording, trim_seconds: tuple[float, float]) -> RangeRecording:
-    """Return the recording without its first `trim[0]` and last `trim[1]` seconds; RecordingError if nothing is left.
+    """Return the recording without the first and last seconds of `trim_seconds`; RecordingError if nothing is left.
 
     Args:
         recording: recording that is read through once.

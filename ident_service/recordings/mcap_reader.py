@@ -276,16 +276,16 @@ class Extras:
 
 
 def read_extras(
-    path: Path, stream: IO[bytes], size: int, utc_offset_ns: int, runs: Iterable[bytes] | None = None
+    path: Path, stream: IO[bytes], size: int, utc_offset_ns: int, expanded_chunks: Iterable[bytes] | None = None
 ) -> Extras:
-    """Return metadata, attachments, events and the arm's description from an open file, up to any damage.
+    """Return metadata, attachments, events and the URDF from an open file, up to any damage.
 
     Args:
         path: for messages.
         stream: the file.
         size: how many bytes of it to read.
         utc_offset_ns: offset to subtract from the events' stamps [ns].
-        runs: runs of records, where the file's chunks have been expanded already.
+        expanded_chunks: bytes of the file's records, where they have been expanded already; None reads the file.
 
     Raises:
         RecordingError: attachments of more than 64 MiB, or a chunk that expands beyond that.
@@ -317,7 +317,7 @@ def read_extras(
     except mcap.TooLargeError as error:
         raise RecordingError(path, str(error)) from error
     try:
-        for run in mcap.contents(stream, size) if runs is None else runs:
+        for run in mcap.contents(stream, size) if expanded_chunks is None else expanded_chunks:
             for channel_id, _, payload in mcap.messages(run, directory, lambda channel_id: bool(kind(channel_id))):
                 if kind(channel_id) == _EVENTS:
                     events.append(decode_event(payload, utc_offset_ns))
@@ -534,7 +534,7 @@ class McapRecording:
         return assemble(pieces, samples, self.path, self.joint_names, skip_missing=self._skip_missing)
 
     def read_extras(self) -> Extras:
-        """Return what stands beside the samples: metadata, attachments, events, the arm's description.
+        """Return what stands beside the samples: metadata, attachments, events, the URDF.
 
         Raises:
             RecordingError: attachments of more than 64 MiB.

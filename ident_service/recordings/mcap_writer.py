@@ -497,7 +497,7 @@ class RecordingWriter:
         self._add(stamp_ns, (("/events", log),))
 
     def finish(self, *, complete: bool = True) -> None:
-        """Write `complete` and the file's end, force it to disk, rename `<path>.partial` to `path`; once only.
+        """Write `complete` as metadata, end the file, force it to disk, rename `<path>.partial` to `path`; once only.
 
         Raises:
             RecordingError: one of these failed; what was written stays in `<path>.partial`.

@@ -27,7 +27,7 @@ def open_recording(
     transmission: Transmission | None = None,
     torque: Literal["measured", "commanded"] | None = "commanded",
 ) -> Recording:
-    """Open an MCAP or CSV recording, told by its content; samples are decoded later, on the joint side.
+    """Open an MCAP or CSV recording, whatever its name, on the joint side; torque None: measured if nearly all have it.
 
     A recording that this package wrote names its joints as the arm does and is on the joint side already: of `fmt`,
     topic, names and side are for the files of others.

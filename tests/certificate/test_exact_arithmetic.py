@@ -16,9 +16,9 @@ from ident_service.certificate_verifier import (
     VerificationError,
     is_positive_definite,
     is_positive_semidefinite,
+    link_condition,
     rational,
     rational_text,
-    set_blocks,
 )
 from ident_service.estimation.certificate import exact_block, repair
 from ident_service.estimation.feasible.feasible_set import feasible_set
@@ -116,7 +116,7 @@ def test_an_affine_number_can_be_read() -> None:
 def test_the_blocks_of_the_solver_are_those_of_the_verifier(kind: Kind) -> None:
     names = tuple(f"{symbol}{link}" for link in (1, 2) for symbol in INERTIAL)
     for link, block in enumerate(feasible_set(kind, names).blocks, 1):
-        assert exact_block(block, names) == set_blocks(kind, link)
+        assert exact_block(block, names) == link_condition(kind, link)
 
 
 def test_a_point_mass_stands_on_the_edge_of_the_4x4_condition() -> None:
@@ -129,7 +129,7 @@ def test_a_point_mass_stands_on_the_edge_of_the_4x4_condition() -> None:
             if i <= j:
                 values[f"L{a}{b}1"] = m * ((square if i == j else 0) - x[i] * x[j])
     for kind in ("inertia", "pseudo_inertia"):
-        block = set_blocks(kind, 1)
+        block = link_condition(kind, 1)
         assert not block.is_positive(values)
         heavier = values | {"m1": m + Fraction(1, 10**20)}
         spread = heavier | {name: heavier[name] + Fraction(1, 10**20) for name in ("Lxx1", "Lyy1", "Lzz1")}

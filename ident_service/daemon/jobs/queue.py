@@ -188,7 +188,7 @@ class LiveJobs:
         return self._thread.is_alive()
 
     def add(self, live: LiveJob, stops_at_begin: int | None = None) -> None:
-        """Queue a job; raise MotionRefused while closing, after a later stop, or if it would have to wait and must not.
+        """Queue a job; MotionRefused while closing, if stopped since `stops_at_begin`, or if it may not wait but must.
 
         Args:
             live: the job.
@@ -461,7 +461,7 @@ class Engine:
 
     @property
     def healthy(self) -> bool:
-        """Return whether both threads run, the queue's loop within 30 s, and no job's end waits to be registered."""
+        """Return whether queue and lease threads run, the queue's loop within 30 s, and all job ends are registered."""
         alive = self._thread.is_alive() and self.live.healthy
         return alive and self._now() - self.beat < 30.0 and not any(one.unentered for one in self.live.entered())
 
@@ -514,7 +514,7 @@ class Engine:
         return row
 
     def cancel(self, job: str, by: str) -> None:
-        """Ask a job to end and return at once: a motion by a controlled stop, a computation by SIGTERM.
+        """Ask a job to end, a motion by a controlled stop, and return at once; UsageError if it has ended already.
 
         Raises:
             UsageError: no such job, or it has ended.

@@ -77,7 +77,7 @@ def reidentifications(db: Database, arm: str | None = None, *, before: str | Non
 
 
 def conclude(db: Database, row: Row, verdict: Verdict, now: float) -> None:
-    """Enter a verdict on a running re-identification; close the dues unless `impossible`, raise an alarm if `changed`.
+    """If a re-identification runs, enter its verdict; close dues unless `impossible`, raise an alarm if `changed`.
 
     Args:
         db: the registry.

@@ -210,7 +210,7 @@ def resume(service: Serving, who: Operator, arm: ArmName) -> answers.AskedAnswer
 
 @router.post("/arms/{arm}/finish")
 def finish(service: Serving, who: Operator, arm: ArmName) -> answers.AskedAnswer:
-    """Finish a run early: the arm goes back to where it stood; return whether a process has the arm."""
+    """Finish a run early: the arm goes straight back if that way is free; return whether a process has the arm."""
     return _ask(service, who.name, arm, "finish")
 
 

@@ -261,7 +261,7 @@ def _named(value: Any, service: Service, row: Row) -> Any:
 
 
 def without_paths(value: Any, state_folder: str, names_by_path: Mapping[str, str] = NOTHING) -> Any:
-    """Make paths in all texts of JSON values relative to the state folder; replace those in `names_by_path`.
+    """Return JSON values with the state folder's path cut from all texts, and each path of `names_by_path` replaced.
 
     Args:
         value: JSON values.

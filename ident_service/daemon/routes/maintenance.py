@@ -257,7 +257,7 @@ def get_reidentification(service: Serving, _: Viewer, name: Id) -> Reidentificat
 
 @router.post("/reidentifications/{name}/lease")
 async def renew_reidentification(service: Serving, who: LeaseKeeper, name: Id) -> LeaseAnswer:
-    """Renew the lease of a re-identification's present step; answer alike where that does not move and has none."""
+    """Renew the lease of a re-identification's present step; if that moves nothing, only answer the same."""
     step = service.scheduler.reidentifications.present_step(name)
     if step is None:
         row = await run_in_threadpool(known_reidentification, service.db, name)

@@ -53,7 +53,7 @@ class UploadAnswer(BaseModel):
 
 @router.post("/uploads", status_code=201)
 def begin_upload(service: Serving, who: Operator, body: NewUpload) -> UploadAnswer:
-    """Begin an upload in a folder, or resume the same person's; return it with the bytes there, or its run."""
+    """Begin to upload a recording, or resume the same person's; return how much has arrived, or the run it became."""
     announced = uploads.Announced(**body.model_dump(), by=who.name)
     try:
         return _answer(uploads.begin_upload(service.db, service.state, announced))

@@ -138,7 +138,7 @@ class ViewAnswer(BaseModel):
 def view_arm(
     service: Serving, _: Viewer, request: Request, arm: ArmName, motion: Id | None = None, speed: Speed = 1.0
 ) -> Response:
-    """Return what a viewer draws: an arm along a motion, `own` (the description's) or by id, or just its figure."""
+    """Return what a viewer draws: an arm along a motion (its id, or `own`: the description's), or just its figure."""
     config = known.known_arm(service.db, service.state, arm).config
     path = None
     if motion is not None and motion != OWN:

@@ -150,7 +150,7 @@ def _home_svg(path: Path, changed: int) -> str:
 
 
 def motion_svg(service: Service, arm: str, motion: str) -> str:
-    """Return an SVG of an arm along the motion of this id, or along its description's own if the id is empty."""
+    """Return an SVG of an arm along the motion of this id; if empty, along its description's identification motion."""
     from ident_service.operations.arm_pictures import motion_picture
 
     return motion_picture(*_motion(service, arm, motion))

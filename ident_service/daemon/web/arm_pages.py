@@ -350,7 +350,7 @@ def show_picture(service: Serving, _: Viewer, arm: ArmName) -> Response:
 
 @router.get("/arms/{arm}/motion.svg")
 def show_motion(service: Serving, _: Viewer, arm: ArmName, motion: Id | Literal[""] = "") -> Response:
-    """Draw an arm along a motion, the description's own if none is named, as an SVG."""
+    """Draw an arm, as an SVG, along the motion of this id; if empty, along its description's identification motion."""
     return picture(motion_svg(service, arm, motion))
 
 
@@ -465,7 +465,7 @@ def pause(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response
 
 @router.post("/arms/{arm}/finish")
 def finish(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
-    """End a run early: the rest of the motion is left out, and the arm goes back to its start."""
+    """End a run early: the arm goes straight back to its start; if that way is not free, the run goes on."""
     arms.finish(service, who, arm)
     return _back(service, arm, form)
 

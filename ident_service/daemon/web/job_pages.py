@@ -111,7 +111,7 @@ def cancel(service: Serving, who: Operator, job: Id, form: Form) -> Response:
 
 @router.get("/exports/{job}/{name}")
 def get_export(service: Serving, _: Viewer, job: Id, name: FileName) -> Response:
-    """Download a file that an export made, never shown as a page."""
+    """Download a file that the export job of this id made, never shown as a page."""
     row = rows.known_job(service.db, job)
     if name not in _exported(service, row):
         raise UnknownId(f"the job {job} has exported no file {name!r}; its page names them")

@@ -85,13 +85,13 @@ def viewer_page() -> HTMLResponse:
 
 
 def viewer_file() -> bytes:
-    """Return the viewer's script."""
+    """Return the content of the script of the API's viewer."""
     return _vendored().joinpath(VIEWER).read_bytes()
 
 
 @lru_cache(maxsize=1)
 def viewer_version() -> str:
-    """Return `PACKAGE-VERSION` of the viewer, a part of its address, so that browsers load a new version."""
+    """Return `PACKAGE-VERSION` of the API's viewer, a part of its address, so that browsers load a new version."""
     document = json.loads(_vendored().joinpath("rapidoc.json").read_text(encoding="utf-8"))
     return f"{document['package']}-{document['version']}"
 

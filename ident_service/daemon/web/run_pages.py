@@ -223,7 +223,7 @@ def list_runs(
     parameter: Annotated[list[str] | None, Query(max_length=8)] = None,
     before: BeforeId = None,
 ) -> Response:
-    """Show a page of the table of runs, the newest first, filtered by arm, kind, tag and text."""
+    """Show a page of runs, newest first, filtered by arm, kind, tag and text; each base `parameter` is a column."""
     labels = known.run_labels(service.db)
     shown, earlier = list[dict[str, Any]](), before
     while len(shown) < _RUNS:
@@ -349,16 +349,16 @@ def trend(service: Serving, who: Viewer, arm: ArmName) -> Response:
     )
 
 
-def trends(sets: list[tuple[Row, IdentifiedSet]], reference: str | None) -> list[dict[str, Any]]:
+def trends(sets: list[tuple[Row, IdentifiedSet]], accepted_run: str | None) -> list[dict[str, Any]]:
     """Return a row per base parameter of the newest set with its change since the accepted set, most significant first.
 
     Args:
         sets: rows of runs and their parameters, the earliest first.
-        reference: run of the accepted set; the first one where it is not among them.
+        accepted_run: id of the run of the accepted set; the first set counts where it is not among them.
     """
     if not sets:
         return []
-    newest, before = sets[-1][1], next((one for row, one in sets if row["id"] == reference), sets[0][1])
+    newest, before = sets[-1][1], next((one for row, one in sets if row["id"] == accepted_run), sets[0][1])
     found = []
     for expression, unit, verdict in zip(newest.expressions, newest.units, newest.verdicts, strict=True):
         series = [_values(one, [expression])[0] for _, one in sets]
