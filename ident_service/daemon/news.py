@@ -23,7 +23,7 @@ from ident_service.errors import IdentError
 from ident_service.operations.moving_arms import moving_arms
 from ident_service.registry import jobs as rows
 from ident_service.registry.database import Database, Row, audit_entries_after, newest_line_id
-from ident_service.registry.state_folder import arm_fault_store
+from ident_service.registry.state_folder import arm_fault_store, known_arms
 
 LOOK: Final = 0.25  # s between polls, however many viewers there are
 _PAGE = 500  # lines that are read at a time
@@ -172,19 +172,16 @@ class EventPoller:
                 del self._standing[key]
 
     def _read_arms(self) -> None:
-        moving, place = set(moving_arms(self._state)), self._state / "arms"
-        folders = [one for one in sorted(place.iterdir()) if not one.name.startswith(".")] if place.is_dir() else []
-        for kind, name in self._standing.keys() - {("arm", folder.name) for folder in folders}:
+        moving, arms = set(moving_arms(self._state)), known_arms(self._state)
+        for kind, name in self._standing.keys() - {("arm", arm) for arm in arms}:
             if kind == "arm":  # it was deleted, which is a line of the trail
                 del self._standing[kind, name]
-        for folder in folders:
+        for arm in arms:
             try:
-                faults = sorted(arm_fault_store(self._state, folder.name).latched())
+                faults = sorted(arm_fault_store(self._state, arm).latched())
             except IdentError:
                 faults = ["unreadable"]  # a damaged file prevents motion like a fault
-            self._update_state(
-                "arm", folder.name, {"arm": folder.name, "moves": folder.name in moving, "faults": faults}
-            )
+            self._update_state("arm", arm, {"arm": arm, "moves": arm in moving, "faults": faults})
 
     def _update_state(self, kind: str, name: str, value: dict[str, Any], *, gone: bool = False) -> None:
         data, before = json.dumps(value, allow_nan=False), self._standing.get((kind, name))

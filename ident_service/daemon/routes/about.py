@@ -24,7 +24,7 @@ from ident_service.errors import IdentError
 from ident_service.operations.drift_alarms import alarms
 from ident_service.operations.maintenance_schedule import pending
 from ident_service.registry.database import audit_log
-from ident_service.registry.state_folder import arm_fault_store
+from ident_service.registry.state_folder import arm_fault_store, known_arms
 from ident_service.registry.tokens import revoke_token, tokens
 
 router = APIRouter(tags=["service"], responses=failures(), generate_unique_id_function=operation_id)
@@ -61,12 +61,12 @@ def healthz(service: Serving, response: Response) -> HealthAnswer:
 def metrics(service: Serving, _: Viewer) -> PlainTextResponse:
     """Return the metrics of the service in Prometheus' text format."""
     rows = service.db.rows("SELECT kind, state, COUNT(*) AS number FROM jobs GROUP BY kind, state")
-    faults, place = dict[str, int](), service.state / "arms"
-    for folder in place.iterdir() if place.is_dir() else ():
+    faults = dict[str, int]()
+    for arm in known_arms(service.state):
         try:
-            faults[folder.name] = len(arm_fault_store(service.state, folder.name).latched())
+            faults[arm] = len(arm_fault_store(service.state, arm).latched())
         except IdentError:
-            faults[folder.name] = 1  # a damaged file prevents motion like a fault
+            faults[arm] = 1  # a damaged file prevents motion like a fault
     jobs = {(row["kind"], row["state"]): row["number"] for row in rows}
     due = Counter[str](row["arm"] for row in pending(service.db))
     drifted = Counter[str](row["arm"] for row in alarms(service.db, most=10_000))
