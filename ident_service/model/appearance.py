@@ -28,7 +28,7 @@ _LEAST = 0.005  # m, of an arm whose joints all meet in one point
 
 
 def visible_bodies(model: ArmModel) -> list[Body]:
-    """Return the solids to draw of base and links, in their joints' frames; sticks for links without known bodies.
+    """Return solids to draw of base and links in their joints' frames; sticks for unknown ones, for all if unreadable.
 
     Geometry that cannot be read is no reason to show nothing: then the whole arm is sticks.
     """

@@ -72,7 +72,7 @@ def surroundings(model: ArmModel) -> list[Body]:
 
 
 def scene(model: ArmModel) -> Scene:
-    """Collect all bodies of arm and workspace, and the pairs of them that must not touch.
+    """Collect bodies of arm and workspace, and pairs that must not touch; MotionRefused if only the workspace has any.
 
     Raises:
         ModelError: a link that does not exist, or a mesh where capsules are needed.

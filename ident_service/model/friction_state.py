@@ -21,7 +21,7 @@ from ident_service.model.chain import Array
 
 
 def presliding_distances(model: ArmModel) -> Array:
-    """Return the pre-sliding distance x0 per drive [rad or m], shape (joints,); zero where none applies.
+    """Return the pre-sliding distance x0 per drive [rad or m], shape (joints,); zero where none applies or was fitted.
 
     Zero where dry friction turns round at once: nothing was fitted, or the arm has no dry friction.
     """

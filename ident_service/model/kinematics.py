@@ -8,7 +8,7 @@ from ident_service.model.chain import WORLD, Array, Chain
 
 
 def frame_origins(chain: Chain, position: Array) -> Array:
-    """Return the origins of base, joint and link frames in the base frame [m], shape (postures, 1 + 2 joints, 3).
+    """Return origins in the base frame [m], (postures, 1 + 2 joints, 3): base, then each joint's and its link's frame.
 
     Args:
         chain: the mechanism.

@@ -78,7 +78,7 @@ class Mechanism:
 def read_mechanism(
     file: TextFile, kind: Kind, kinematics: Kinematics | None = None, *, trusted: bool = False
 ) -> Mechanism:
-    """Read the arm's mechanism from URDF or MJCF text; raises ModelError where it is refused or has no such part.
+    """Read an arm's mechanism from a URDF, or an MJCF in a limited process unless `trusted`; ModelError if refused.
 
     Args:
         file: name and text of the file.

@@ -210,7 +210,7 @@ _UNSUPPORTED = ("JointModelPlanar",)
 
 
 def urdf_document(file: TextFile, selection_json: str | None) -> dict[str, Any]:
-    """Read a URDF here; return its mechanism as JSON, or an `error`, as where a joint mimics one that moves."""
+    """Read a URDF in this process; return its mechanism as JSON values or `error`, as for mimics of moving joints."""
     return _document("URDF", lambda: pin.buildModelFromXML(file.text), selection_json or "{}", lambda: mimics(file))
 
 

@@ -404,7 +404,7 @@ def _mesh_file(mesh: ET.Element, folder: Path) -> Array | None:
 
 
 def mesh_triangles(path: Path, scale: Array) -> Array | None:
-    """Return the triangles of a mesh file [m], shape (triangles, 3, 3); None if too large or unreadable, not if absent.
+    """Return a mesh file's triangles [m], (triangles, 3, 3); None if too large or unreadable; OSError if absent.
 
     Args:
         path: of the file; its ending says how it is read.

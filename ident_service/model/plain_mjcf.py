@@ -52,7 +52,7 @@ def build_from_mjcf(
 
 
 def plain_mjcf(text: str, mesh_folder: Path | None = None) -> str:
-    """Return an MJCF rewritten in radians, without classes and frames; raises ModelError for what cannot be."""
+    """Return an MJCF in radians, without classes or frames, meshes from `mesh_folder`; ModelError if impossible."""
     root = parse_xml(text)
     if root.tag != "mujoco":
         return text

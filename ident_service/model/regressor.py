@@ -287,7 +287,7 @@ class RegressorGradient:
         self._H = np.zeros((0, 0, 0))
 
     def run(self, position: Array, velocity: Array, acceleration: Array, direction: Array) -> Array:
-        """Return the regressor H, shape (joints, columns, samples), and keep its values for `pull`.
+        """Return the regressor H, (joints, columns, samples), overwritten by the next run; keep values for `pull`.
 
         Args:
             position: [rad or m], shape (samples, joints).

@@ -225,7 +225,7 @@ class Differentiable:
         return self._forward.steps, self._backward.steps
 
     def run(self, values: Array) -> Array:
-        """Return the outputs, shape (outputs, samples), and keep the values that `pull` needs.
+        """Return the outputs, (outputs, samples), overwritten by the next run; keep the values that `pull` needs.
 
         Args:
             values: all inputs of the tape, shape (inputs, samples).

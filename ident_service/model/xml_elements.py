@@ -9,7 +9,7 @@ from ident_service.errors import ModelError
 
 
 def parse_xml(text: str) -> ET.Element:
-    """Parse XML text that has passed `require_parser_limits`; return its root, undeclared prefixes kept in names.
+    """Parse XML after `require_parser_limits`, undeclared prefixes kept; return its root; ModelError if malformed.
 
     Tools of simulators add attributes such as `drake:acceleration`, and often do not declare their prefixes.
 

@@ -46,7 +46,7 @@ class StopSecuring(Enum):
 
 
 def joints_with_weight(model: ArmModel, limits: MotionLimits) -> tuple[str, ...]:
-    """Return the names of joints whose gravity torque exceeds 0.1 % of their torque limit in any of 64 random postures.
+    """Return joints whose gravity torque exceeds 0.1 % of its limit in any of 64 postures; MotionRefused if no prior.
 
     Args:
         model: model with prior parameters.

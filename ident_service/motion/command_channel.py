@@ -80,7 +80,7 @@ class Controls(Protocol):
 
     @property
     def finish(self) -> bool:
-        """Return whether the run is to end early: the arm comes to rest and goes straight back to where it began."""
+        """Return whether the run is to end early: the arm rests and goes straight back to where it began, if free."""
 
     @property
     def supported(self) -> bool:
@@ -272,7 +272,7 @@ class ControlFile:
         return self._memory[_FINISH] != 0
 
     def request_finish(self) -> None:
-        """Request that the run end early by going back to where it began; not revocable; resume a paused arm first."""
+        """Request that the run end early by going straight back, if free; not revocable; resume a paused arm first."""
         self._memory[_FINISH] = 1
 
     @property

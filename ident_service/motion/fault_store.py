@@ -120,7 +120,7 @@ class FaultStore:
         write_atomically(self._mark, json.dumps(mark) + "\n" + " " * _ROOM)
 
     def ended(self) -> None:
-        """Remove the mark of a moving arm; where the mark itself stores faults, note in it that the motion has ended.
+        """Remove the mark that `began` wrote; one in which faults are stored stays, with a note that the motion ended.
 
         A mark that stores faults stays until they are acknowledged.
 
@@ -164,11 +164,11 @@ class FaultStore:
                     self._write_into_mark(mark, line, mark.size - _LAST_LINE)
 
     def acknowledge(self, code: str) -> str:
-        """Remove a fault from the store and return its cause; UsageError if it is not stored or the arm is still held.
+        """Remove a fault from the store and return its cause; UsageError if not stored or a process controls the arm.
 
         Raises:
-            UsageError: no fault of this name is latched, or a file was damaged by somebody; or the arm is still held
-                after it, whereupon it would be latched again.
+            UsageError: no fault of this name is latched, or a file was damaged by somebody; or a process still controls
+                the arm, as one that holds it after the fault does, and would latch it again.
         """
         with self._locked():
             return self._acknowledged(code)

@@ -59,7 +59,7 @@ class PositionFile:
         self._path.unlink(missing_ok=True)
 
     def keep(self, arm: Arm) -> None:
-        """Replace the stored position by where a closed arm stands, or by none if it moves, fails or is simulated.
+        """Open a closed arm read-only for 0.5 s, store where it stands; store none if it moves, fails or is simulated.
 
         Arms that are new whenever they are opened, simulated ones, have no such position.
         """
@@ -90,7 +90,7 @@ class PositionFile:
             raise MotionRefused(f"{words}; {LOOK_AT_IT}")
 
     def read(self) -> LastPosition | None:
-        """Return the stored position; None without one, and for one stored for other joints, gears or counts.
+        """Return the stored position; None without one or for other joints, gears or counts; UsageError if damaged.
 
         Raises:
             UsageError: the file was damaged by somebody.

@@ -61,7 +61,7 @@ class Paused:
         return self._stop.at(time)
 
     def resume(self, limits: MotionLimits | None = None) -> Resumed:
-        """Plan a way from rest back onto the motion; return both, joined; may take tenths of a second.
+        """Plan a way from rest onto the motion, best where it was left; return both, joined; MotionRefused if none.
 
         It joins the motion where it was left. Where no way leads there within the limits, it joins a little earlier and
         repeats that little; else a little later; else it begins the motion again. This takes a millisecond or few where
@@ -78,7 +78,7 @@ class Paused:
     def resume_in_slices(
         self, limits: MotionLimits | None = None, surroundings: ClearanceChecker | None = None
     ) -> Generator[None, None, Resumed]:
-        """Plan in slices a way from rest back onto the motion, clear of `surroundings`; return both, joined.
+        """Plan in slices a way from rest back onto the motion, clear of `surroundings`; the generator returns both.
 
         Args:
             limits: as for `resume`.

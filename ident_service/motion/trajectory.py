@@ -112,7 +112,7 @@ class RuckigReference:
         return Setpoint(np.array(position), np.array(velocity), np.array(acceleration))
 
     def extent(self) -> tuple[Vector, Vector]:
-        """Return the lowest and highest position at times sampled every `_EXTENT_STEP` [rad or m], (joints,) each."""
+        """Return the lowest and highest position at times sampled every millisecond [rad or m], (joints,) each."""
         return run_to_end(self.extent_in_slices())
 
     def extent_in_slices(self) -> Generator[None, None, tuple[Vector, Vector]]:

@@ -168,7 +168,7 @@ def follow_stroke(session: Session, stroke: TestMotion) -> tuple[Rows, Rows]:
 
 
 def judge_response(trace: Trace, stroke: TestMotion, session: Session) -> JointResponse:
-    """Return what a complete test motion shows: displacement and response over expected, deviation of the latter."""
+    """Return what a complete test motion shows: displacement / expected, response / expected with its deviation."""
     answers, doubt = _response_to_torque(trace, stroke.joint, session)
     return JointResponse(_displaced(trace, stroke) / stroke.amplitude, answers, doubt)
 
@@ -454,7 +454,7 @@ REMEDY = (
 
 
 def too_heavy_check(gravity_torque: Vector, model: ArmModel, limits: MotionLimits) -> Check | None:
-    """Return a failed check if the model's gravity torque takes too much of a torque limit; else None.
+    """Return a failed check `gravity` if the model's gravity torque exceeds 80 % of a torque limit; else None.
 
     Args:
         gravity_torque: the model's torque where the arm stands [N m or N], shape (joints,).

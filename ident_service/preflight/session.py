@@ -406,7 +406,11 @@ class Session:
         return trace_of(self._rows, self.period)
 
     def release(self) -> None:
-        """Hand the arm back to its support, or to its brakes: torque fades, then the drives are switched off."""
+        """Hand the arm back to its support, or to its brakes: torque fades, then the drives are switched off.
+
+        Raises:
+            ArmFault, DriverError: from the loop; the drives are still enabled, and the caller stops them.
+        """
         cycles = 1 if self.gives_positions else max(1, round(RELEASE / self.period))
         held = self._target
         for left in range(cycles - 1, -1, -1):

@@ -46,7 +46,9 @@ Confirm = Callable[[str], str]
 
 
 def consent_check(model: ArmModel, sample: Sample, confirm: Confirm) -> Check | None:
-    """Ask a person for the arm's name, without which nothing is energised; return None if given, else the failed check.
+    """Ask a person for the arm's name; return None if typed, else a check: NEEDS_PERSON, or FAILED if no drive status.
+
+    Without the name nothing is energised.
 
     Args:
         model: model of the arm, whose name must be typed.
