@@ -219,9 +219,7 @@ def _csv_table(path: Path, text: str, convention: str | None) -> tuple[DHTable, 
     if problems:
         raise ConfigError(problems)
     places = [number for number, _ in numbered[1:]]
-    return _table(
-        rows, convention or (said[1] if said else None), lambda joint: Problem(path, places[joint], 1, ""), path
-    )
+    return _table(rows, convention, said[1] if said else None, lambda joint: Problem(path, places[joint], 1, ""), path)
 
 
 def _cell(name: str, cell: str, scale: float) -> Any:
@@ -247,16 +245,27 @@ def _yaml_table(path: Path, convention: str | None) -> tuple[DHTable, dict[str, 
     names = list(joints)
     return _table(
         {name: dict(row) for name, row in joints.items()},
-        convention or value.get("convention"),
+        convention,
+        value.get("convention"),
         lambda joint: tree.problem(("joints", names[joint]), "", path),
         path,
     )
 
 
 def _table(
-    rows: dict[str, dict[str, Any]], convention: str | None, place: Callable[[int], Problem], path: Path
+    rows: dict[str, dict[str, Any]],
+    given_convention: str | None,
+    own_convention: str | None,
+    place: Callable[[int], Problem],
+    path: Path,
 ) -> tuple[DHTable, dict[str, FileLimits]]:
     """Check a DH table and the limits beside its rows."""
+    if given_convention is not None and own_convention is not None and given_convention != own_convention:
+        raise UsageError(
+            f"{path}: names the convention {own_convention}, but --convention says {given_convention}; with the wrong "
+            "one it is another arm: leave out --convention, or correct the table"
+        )
+    convention = given_convention or own_convention
     if convention not in ("standard", "modified"):
         raise UsageError(
             f"{path}: which convention is it? Give --convention standard (distal frames, Rz Tz Tx Rx) or --convention"

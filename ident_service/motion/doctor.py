@@ -207,7 +207,7 @@ def _held(woken: Woken, every: int, described: float | None, watchdogs: tuple[Wa
     stalls = int(too_long[0]) + int((too_long[1:] & ~too_long[:-1]).sum())
     # A slot that is reached later than this is left to the next one.
     lost = np.concatenate([[0], np.cumsum(late > LATE * period)])
-    second = min(round(1.0 / period), len(late))
+    second = min(max(round(1.0 / period), 1), len(late))
     most = int((lost[second:] - lost[:-second]).max())
     return Held(1.0 / period, survived, stalls, most * period, stalls == 0 and most <= (1.0 - SUCCESS) / period)
 

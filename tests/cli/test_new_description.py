@@ -25,7 +25,7 @@ from ident_service.config.kinematics import angles_barely_rounded
 from ident_service.config.load import load_arm
 from ident_service.config.motion_limits import motion_limits
 from ident_service.config.simulation import SimulatedDriver
-from ident_service.errors import ModelError
+from ident_service.errors import ModelError, UsageError
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model, control_model
 from ident_service.model.base_parameters import base_parameters
@@ -283,6 +283,15 @@ def test_an_offset_is_theta_or_the_d_of_a_slide(tmp_path: Path) -> None:
         assert table is not None
         assert (table.joints["j1"].theta, table.joints["j1"].d) == pytest.approx((math.pi / 2, 0.1))
         assert (table.joints["j2"].theta, table.joints["j2"].d) == (0.0, 0.2)
+
+
+@pytest.mark.parametrize("text", ["# convention: standard\na\n1\n", "convention: standard\njoints: {j1: {a: 1}}\n"])
+def test_a_table_is_not_read_in_another_convention_than_it_names(text: str, tmp_path: Path) -> None:
+    table = tmp_path / f"t.{'csv' if text.startswith('#') else 'yaml'}"
+    table.write_text(text)
+    assert read_source(table, "standard") == read_source(table)
+    with pytest.raises(UsageError, match="names the convention standard, but --convention says modified"):
+        read_source(table, "modified")
 
 
 @pytest.mark.slow

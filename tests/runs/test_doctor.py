@@ -174,6 +174,7 @@ def rates(
 
 def test_a_computer_that_wakes_in_time_holds_every_rate() -> None:
     assert rates(woken()) == dict.fromkeys((1000, 500, 250, 200, 100), (True, 0))
+    assert judge_rates(woken(rate=100.0), 0.4, None)[-1].good
     assert set(rates(woken(), 125.0)) == {1000, 500, 250, 200, 125, 100}
 
 
