@@ -113,7 +113,7 @@ def configured(faults: Sequence[SimulatedFault], names: Sequence[str], period: f
 
 
 def parse_fault(text: str, names: Sequence[str]) -> DriveFault:
-    """Parse a fault as people write it: `KIND [joint=NAME] [at=S] [duration=S] [size=X] [offset=X,Y,Z]`.
+    """Parse a fault, `KIND [joint=NAME] [at=S] [duration=S] [size=X] [offset=X,Y,Z]`; DriverError for a wrong one.
 
     Args:
         text: the words.
