@@ -46,7 +46,7 @@ _ROUNDS = 500
 
 
 def stick_slip_velocity(A: Vector, b: Vector, friction_bound: Vector, guess: Vector) -> Vector:
-    """Solve A v + friction = b, dry friction at most `friction_bound`, from the signs of `guess`; 0 where one sticks.
+    """Return v of A v + friction = b, friction at most `friction_bound`, from the signs of `guess`; 0 where it sticks.
 
     Args:
         A: symmetric positive definite, shape (joints, joints).

@@ -413,7 +413,7 @@ class RemoteArm:
         return self._begin("home", confirm)
 
     def finish(self) -> None:
-        """Ask the arm's run to end early, without waiting: it leaves out the rest and goes to its start."""
+        """Ask the arm's run to end early by going straight back, if that is free, without waiting for that."""
         self.client.post(f"{self._path}/finish")
 
     def accept(self, run: str, note: str) -> dict[str, Any]:

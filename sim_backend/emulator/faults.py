@@ -78,7 +78,7 @@ class DriveFault:
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def window(self, start_ns: int, period_ns: int) -> tuple[int, int | None]:
-        """Return when the fault begins and when it ends [ns]; the end is None where it stays.
+        """Return when the fault, counted from `start_ns`, begins and ends [ns]; the end is None where it stays.
 
         Args:
             start_ns: moment that `at` counts from.

@@ -77,7 +77,7 @@ class PythonCanBuses:
 
     @property
     def waits(self) -> bool:
-        """Return whether a received frame is queued already, so that `receive` returns at once; False for one bus."""
+        """Return whether a received frame is queued already, so that `receive` returns at once; False with one bus."""
         return not self._heard.empty()
 
     def receive(self, timeout: float) -> tuple[int, Frame] | None:
