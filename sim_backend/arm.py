@@ -124,7 +124,7 @@ class SimulatedArm(Arm):
         self._machine.reset()
 
     def exchange(self, torque: Vector | None) -> Sample:
-        """Advance the plant by one cycle, apply the torque, or the last one on None, and return the sample.
+        """Advance the plant by one cycle, then queue the torque (None: the last one again); return the new sample.
 
         Raises:
             DriverError: as in the contract; or the plant ran away, or a fault took the bus, both of which use up

@@ -160,7 +160,7 @@ class Drives:
 
     @property
     def watchdog_expired(self) -> bool:
-        """Return whether the watchdog's time has passed without a frame."""
+        """Return whether the watchdog's time has passed without a torque frame."""
         return self._silent >= self._watchdog
 
     @property
@@ -187,7 +187,7 @@ class Drives:
         self.on = True
 
     def release(self, kind: StopKind) -> None:
-        """Drop every torque that has not begun to act; a quick stop leaves all axes idle until enabled again."""
+        """Switch off after this period, dropping waiting torques; a quick stop leaves axes idle until enabled."""
         self._forget()
         self.on = False
         if kind is StopKind.QUICK_STOP:
@@ -232,7 +232,7 @@ class Drives:
         self._begin(faults)
 
     def output(self) -> Vector:
-        """Return the torque with its noise that moves the plant for one period [N m or N], shape (joints,)."""
+        """Return the torque, with freshly drawn noise, that moves the plant in a period [N m or N], shape (joints,)."""
         if not (self._noisy and self._energised):
             return self.torque
         noise = self._imperfections.torque_noise * self._noise.standard_normal(self.torque.size)

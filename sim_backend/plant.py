@@ -46,7 +46,7 @@ _ROUNDS = 500
 
 
 def stick_slip_velocity(A: Vector, b: Vector, friction_bound: Vector, guess: Vector) -> Vector:
-    """Solve A v + friction = b for v, dry friction at most `friction_bound`; v is exactly 0 for joints that stick.
+    """Return v of A v + friction = b, friction at most `friction_bound`, from the signs of `guess`; 0 where it sticks.
 
     Args:
         A: symmetric positive definite, shape (joints, joints).
@@ -276,7 +276,7 @@ class Plant:
         return self._position, self._velocity, self._acceleration, self._braking, self._loads
 
     def set_braking(self, damping: Array) -> None:
-        """Set the viscous friction that brakes every step from now on, in place of that set before.
+        """Set the damping that brakes every step from now on: one per joint, or a symmetric matrix over the joints.
 
         Args:
             damping: [N m s/rad or N s/m], shape (joints,), none negative; or, where drives move several joints each,
@@ -287,7 +287,7 @@ class Plant:
             self._damp()
 
     def rest(self) -> None:
-        """Stop the arm where it is, as if somebody held it."""
+        """Set velocity and acceleration to 0 where the arm is, as if somebody had stopped it; the next step goes on."""
         self.place(self._position)
 
     def place(self, position: Array) -> None:

@@ -362,13 +362,13 @@ class PlantProcess:
 
 
 def start_document(
-    config: ArmConfig, faults: tuple[Fault, ...], address: str, status: int, *, lock_step: bool
+    config: ArmConfig, faults: tuple[Fault, ...], address: str, status_descriptor: int, *, lock_step: bool
 ) -> dict[str, object]:
     """Return the JSON object that a plant process reads from its standard input; see `main`."""
     listed = [[f.at_cycle, f.kind.value, f.joint, f.duration, f.size, f.offset] for f in faults]
     return {
         "address": address,
-        "status": status,
+        "status": status_descriptor,
         "lock_step": lock_step,
         "sha256": config.sha256,
         "faults": listed,

@@ -115,7 +115,7 @@ def encode_status(status: PlantStatus) -> bytes:
 
 
 def decode_status(data: bytes) -> PlantStatus | None:
-    """Decode the record; None if it was read while being written, or none has been written yet.
+    """Decode the record; None if it is half written or none was written yet; DriverError for bytes of something else.
 
     Raises:
         DriverError: bytes of something else.

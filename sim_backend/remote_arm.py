@@ -124,14 +124,14 @@ def _end(process: subprocess.Popen[bytes], status: int) -> None:
     os.close(status)
 
 
-def address_of(bus: str | None) -> str:
-    """Return the socket address of this user's plant of that name; a random one without a name."""
+def plant_address(bus: str | None) -> str:
+    """Return the socket address, without its leading NUL, of this user's plant called `bus`; a random one for None."""
     name = f"{os.getpid()}-{secrets.token_hex(8)}" if bus is None else f"bus-{bus}"
     return f"ident-plant-{os.getuid()}-{name}"
 
 
-def connect(address: str) -> socket.socket | None:
-    """Connect to the plant that listens at an address; None if none does."""
+def connect_to_plant(address: str) -> socket.socket | None:
+    """Connect to the plant that listens at an address of `plant_address`, and return the socket; None if none does."""
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
         sock.connect("\0" + address)
@@ -197,7 +197,7 @@ class RemoteArm(Arm):
         self._config, self._added = config, tuple(faults)
         self._schedule = Schedule(clock, round(twin.plant.period * 1e9), skips=not clock.lock_step)
         self._deadline = driver.deadline or (_DEADLINE_LOCK_STEP if clock.lock_step else _DEADLINE_REAL)
-        self._address = address_of(driver.bus)
+        self._address = plant_address(driver.bus)
         self._status = driver.status
         self._launch: PlantLaunch | None = None
         self._socket: socket.socket | None = None
@@ -317,7 +317,7 @@ class RemoteArm(Arm):
 
     def _enter(self) -> bool:
         """Become the client of the plant at the address; returns False if there is none."""
-        sock = connect(self._address)
+        sock = connect_to_plant(self._address)
         if sock is None:
             return False
         self._socket = sock

@@ -246,7 +246,7 @@ class IdentClient(Connection):
     def upload(
         self, arm: str, file: Path, *, columns: str = "", tell: Callable[[float], None] = lambda _: None
     ) -> dict[str, str]:
-        """Upload a recording, only the pieces that have not arrived before; return its `run` id and `name` for jobs.
+        """Upload what has not arrived of a recording (`columns`: YAML of a CSV's layout); return its `run` and `name`.
 
         Args:
             arm: name of the arm that it is of.
@@ -279,18 +279,18 @@ class IdentClient(Connection):
         tell(1.0)
         return {"run": str(seen["run"]), "name": str(seen["name"])}
 
-    def begin(self, kind: str, *, key: str | None = None, **asked: Any) -> Job:
+    def begin(self, kind: str, *, key: str | None = None, **fields: Any) -> Job:
         """Queue a computation and return its job at once; with the `key` of an earlier one, return that job instead.
 
         Args:
             kind: `simulate`, `design`, `identify`, `export` and so on.
             key: an idempotency key: within a day, the same request with it is the same job.
-            asked: fields of the request.
+            fields: fields of the request, by name; None leaves one out.
         """
-        body = {"job": {"kind": kind, **{name: value for name, value in asked.items() if value is not None}}}
+        body = {"job": {"kind": kind, **{name: value for name, value in fields.items() if value is not None}}}
         return _job(self.post(f"{_API}/jobs", body, {} if key is None else {"Idempotency-Key": key}))
 
-    def compute(self, kind: str, *, key: str | None = None, **asked: Any) -> Job:
+    def compute(self, kind: str, *, key: str | None = None, **fields: Any) -> Job:
         """Queue a computation, wait for its end and return the job, `done` or `refused`; any other end raises.
 
         Returns:
@@ -299,7 +299,7 @@ class IdentClient(Connection):
         Raises:
             IdentError: it failed, with the error of the command that did it; or somebody cancelled it.
         """
-        ended = self.wait(self.begin(kind, key=key, **asked).id)
+        ended = self.wait(self.begin(kind, key=key, **fields).id)
         if ended.state not in ("done", "refused"):
             raise self.failure(ended)
         return ended
@@ -368,7 +368,7 @@ class RemoteArm:
         return found
 
     def supported(self, *, confirm: str) -> None:
-        """Confirm that the arm, which is held after a stop, is supported or home; it is then let down.
+        """Confirm, by the arm's name, that the arm held after a stop is supported or home; it is then let down.
 
         Args:
             confirm: the arm's name, as a person has typed it who sees it.
@@ -383,13 +383,18 @@ class RemoteArm:
         self.client.post(f"{self._path}/faults/{_word(code)}/ack")
 
     def check(self, motion: str | None = None, *, confirm: str) -> RemoteMotion:
-        """Queue the preflight of a motion, the description's if None; return a handle whose block renews the lease."""
+        """Queue a preflight (`confirm`: the arm's name); return its handle, whose `with` block renews the lease.
+
+        Args:
+            motion: id; the description's own if None.
+            confirm: the arm's name, as a person has typed it who sees it.
+        """
         return self._begin("check", confirm, motion=motion)
 
     def run(
         self, motion: str | None = None, *, confirm: str, speed: float | None = None, until: float | None = None
     ) -> RemoteMotion:
-        """Queue a run, finished early at the accuracy `until`; return a handle whose block renews the lease and waits.
+        """Queue a run, ended early once relative deviations reach `until`; return its handle, for a `with` block.
 
         Args:
             motion: id; the description's own if None.
@@ -404,11 +409,11 @@ class RemoteArm:
         return self._begin("run", confirm, motion=motion, speed=speed, until=share)
 
     def home(self, *, confirm: str) -> RemoteMotion:
-        """Queue the motion to the home position; return its handle, whose `with` block renews the lease."""
+        """Queue the motion home (`confirm`: the arm's name); return its handle, whose `with` block renews the lease."""
         return self._begin("home", confirm)
 
     def finish(self) -> None:
-        """Ask the arm's run to end early, without waiting: it leaves out the rest and goes to its start."""
+        """Ask the arm's run to end early by going straight back, if that is free, without waiting for that."""
         self.client.post(f"{self._path}/finish")
 
     def accept(self, run: str, note: str) -> dict[str, Any]:

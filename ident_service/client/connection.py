@@ -114,7 +114,7 @@ class Connection:
             yield from self._document(status, content)
 
     def content(self, path: str) -> bytes:
-        """Download a file and return its bytes; raise IdentError if it is refused, or of `_MOST` bytes or more.
+        """Download a file and return its bytes; raise IdentError if it is refused, or has 64 MiB or more.
 
         Raises:
             IdentError: as `ask`; or it is larger than what is taken.

@@ -115,7 +115,7 @@ class TorqueLimit(Section):
     below: Annotated[int, Field(strict=True, ge=1)] | None = None
 
     def entry_or_limit(self, counts: int) -> int:
-        """Convert a limit [counts] to the entry's value, or back: the same, or `below` less it if set, at least 0."""
+        """Convert a limit [counts] to the entry's value, or back: unchanged, or `below` less the limit, at least 0."""
         return counts if self.below is None else max(self.below - counts, 0)
 
 

@@ -50,7 +50,7 @@ def find_arm(arm: str) -> Path:
 
 
 def load_arm(arm: str | Path, *, upload: bool = False) -> ArmConfig:
-    """Return the checked description of a YAML file or shipped arm; raises ConfigError that lists its mistakes.
+    """Return the checked description of a YAML file or shipped arm; ConfigError for mistakes, UsageError if absent.
 
     Args:
         arm: a YAML file, or the name of a shipped description.
@@ -107,7 +107,7 @@ def read_eds_file(path: str) -> TextFile:
 
 
 def arm_from_json(path: Path) -> ArmConfig:
-    """Read the complete description that results or a recording store as JSON; raises ConfigError where it is none.
+    """Read the description that results or a recording store as JSON; ConfigError if it is none, UsageError if absent.
 
     Raises:
         UsageError: no such file.

@@ -40,7 +40,7 @@ class MotorLimits:
         return tuple(f"motor {number + 1}" for number in range(len(self.torque)))
 
     def torque_shares(self, joint_torque: Vector) -> Vector:
-        """Return each motor's share of its torque limit for joint torques [N m or N], shape (..., motors)."""
+        """Return each motor's |torque| as a share of its limit, shape (..., motors), for joint torques [N m or N]."""
         return np.asarray(np.abs(joint_torque @ self.to_motors.T) / self.torque)
 
     def torque_shares_of_joints(self, joint_torque: Vector) -> Vector:
@@ -49,7 +49,7 @@ class MotorLimits:
         return np.asarray(shares.max(axis=-1))
 
     def scaled_within(self, joint_torque: Vector) -> Vector:
-        """Return joint torques [N m or N] scaled down until no motor exceeds its limit, shape (joints,).
+        """Return joint torques [N m or N], scaled down by one factor per group of joints that share overloaded motors.
 
         Joints that share motors are scaled by one factor, so that no joint is pushed the other way, as drives do that
         are asked for too much (`drivers/motor_units.py`).

@@ -114,7 +114,7 @@ class TextFile(Section):
 
 
 def read_relative_file(value: Any, info: ValidationInfo) -> Any:
-    """Return name and text of the file that a `LocatedStr` names (bounded, UTF-8); other values unchanged.
+    """Return name and text of the file (bounded, UTF-8) that a string names, beside its YAML file; else `value` itself.
 
     Where the validation's context names the folder of the YAML file as `upload`, only files in it are read, and none is
     looked for elsewhere: who sends a description learns nothing about other files.

@@ -145,7 +145,7 @@ class CanBusServer:
             self.advance_to(time.monotonic_ns())
 
     def watched(self) -> tuple[list[int], int | None]:
-        """Return the descriptors to wait for, and when the frame under way ends [ns], None while there is none."""
+        """Return the descriptors to wait for (none once closed), and when the frame under way ends [ns] or None."""
         with self.lock:
             if self._listener is None:
                 return [], None

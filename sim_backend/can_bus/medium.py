@@ -256,7 +256,7 @@ class Medium:
         self._to_destroy[port] = count
 
     def set_counters(self, port: BusEndpoint, send_errors: int, receive_errors: int, now_ns: int) -> None:
-        """Set a controller's error counters, with the change of state that follows; 256 sending is bus-off."""
+        """Set a controller's error counters, and its state by them: 256 send errors are bus-off, until `restart`."""
         self._note(port, port.counters.set(send_errors, receive_errors, now_ns))
 
     def restart(self, port: BusEndpoint, now_ns: int) -> None:

@@ -46,7 +46,7 @@ class Welcome:
 
 
 def pack_hello(hello: Hello) -> bytes:
-    """Encode the greeting that an end sends first; the label is cut to 32 bytes."""
+    """Encode the greeting that an end sends first, label cut to 32 bytes; DriverError for more than 16 filters."""
     if len(hello.filters) > _MAX_FILTERS:
         raise DriverError(f"{len(hello.filters)} filters, at most {_MAX_FILTERS}")
     label = hello.label.encode()[:32].decode(errors="ignore").encode()

@@ -74,7 +74,7 @@ class VendorWatchdogs:
         self._node.stop_timer(_TARGET)
 
     def timer_ran_out(self, timer: str) -> None:
-        """Send the emergency of a missing SYNC or target and stop the drive, if `timer` is of one; ignore others."""
+        """Add the error of a missing SYNC or target, and let the drive react by 6007h, if `timer` is of one."""
         if timer in (_SYNC, _TARGET):
             self._emergency.add_error(NO_SYNC if timer == _SYNC else NO_TARGET)
             self._late()
@@ -115,7 +115,7 @@ class PositionLoop:
         self._line, self._integral = None, 0.0
 
     def torque(self, now_ns: int, max_torque: float) -> float:
-        """Return the motor torque that the loop asks for [N m]; above `max_torque` the integral part is frozen."""
+        """Step the loop and return the motor torque it asks for [N m]; above `max_torque` its integral is frozen."""
         goal, per_radian = self._objects.number(0x607A), self._motor.counts_per_turn / (2.0 * math.pi)
         actual = self._motor.encoder(now_ns)
         if self._line is None:
@@ -297,7 +297,7 @@ class PowerStage:
         self.state = PowerState.SWITCH_ON_DISABLED
 
     def shut_down(self) -> None:
-        """Enter `not ready to switch on`, as when the firmware stops."""
+        """Enter `not ready to switch on`, as when the firmware stops; the motor stays as it is."""
         self._node.stop_timer(_RAMP)
         self.state = PowerState.NOT_READY
 
@@ -616,7 +616,7 @@ class CanopenDrive:
         self.deaf = ignored
 
     def set_warning(self, active: bool, now_ns: int) -> list[Frame]:
-        """Set or clear the warning bit of the statusword; return the frames that the drive sends."""
+        """Begin or end a warning (statusword bit 7, which errors set too); return the frames that the drive sends."""
         self._node.now_ns = now_ns
         self._warned = active
         return self._finish()

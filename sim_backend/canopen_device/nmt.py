@@ -111,7 +111,7 @@ class Nmt:
         self._to(State.PRE_OPERATIONAL)
 
     def configure_producer(self) -> None:
-        """Apply a change of object 1017h; a new heartbeat begins at once."""
+        """Apply a change of object 1017h: send a heartbeat at once and by the new period from then on; none at 0."""
         self._node.stop_timer(_PRODUCER)
         if self.state is not State.INITIALISING:
             self._send_heartbeat()

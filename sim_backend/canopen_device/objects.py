@@ -155,7 +155,7 @@ class Objects:
         return self.packed(key)
 
     def packed(self, key: int) -> bytes:
-        """Return an entry's bytes, little-endian; a number too large for it loses its upper ones, as in drives."""
+        """Return the bytes of entry `key` (index << 8 | sub-index), little-endian; overlong numbers are truncated."""
         value = self.values[key]
         if isinstance(value, bytes):
             return value

@@ -58,7 +58,7 @@ class Layout:
 
 
 def layout(objects: Objects, index: int, count: int | None = None) -> Layout:
-    """Return the layout of a PDO, packing and entries, by its mapping parameter.
+    """Return a PDO's byte layout by its mapping parameter `index`, of `count` entries; SdoAbort where it cannot be.
 
     Args:
         objects: object dictionary that holds the mapping.
@@ -237,7 +237,7 @@ class Pdos:
             self._node.stop_timer(name)
 
     def receive(self, identifier: int, data: bytes) -> bool:
-        """Process an RPDO's frame; return whether more may have changed at once than its data, which wait for SYNC."""
+        """Process an RPDO's frame; return False where nothing has changed: its data wait for SYNC, or PDOs are off."""
         changed = bool(self._emergency.active)
         if not self._active:
             return False

@@ -232,7 +232,7 @@ class Emulator:
         self._configured += tuple(faults)
 
     def clear(self, now_ns: int) -> None:
-        """End all faults that act, with the next `tick`, and drop those that have not begun yet."""
+        """End acting faults with the next `tick` and drop scheduled ones; those that wait for the first SYNC stay."""
         self._to_begin.clear()
         self._to_end = [(now_ns, fault) for fault in self._injection.active]
         self._deadline = None

@@ -93,7 +93,7 @@ class EmulatedDevice(BusDevice, Protocol):
         """Set or clear a warning of the drive, and return the frames to send."""
 
     def switch_supply(self, on: bool, now_ns: int) -> list[Frame]:
-        """Switch the motors' power, or the whole arm's e-stop, and return the frames to send, if any."""
+        """Switch the motor's power (a puck: release or press the whole arm's e-stop); return the frames to send."""
 
     def reboot(self, now_ns: int) -> list[Frame]:
         """Restart the firmware by itself, and return the frames to send."""

@@ -78,7 +78,7 @@ class DriveFault:
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def window(self, start_ns: int, period_ns: int) -> tuple[int, int | None]:
-        """Return when the fault begins and when it ends [ns]; the end is None where it stays.
+        """Return when the fault, counted from `start_ns`, begins and ends [ns]; the end is None where it stays.
 
         Args:
             start_ns: moment that `at` counts from.
@@ -113,7 +113,7 @@ def configured(faults: Sequence[SimulatedFault], names: Sequence[str], period: f
 
 
 def parse_fault(text: str, names: Sequence[str]) -> DriveFault:
-    """Parse a fault as people write it: `KIND [joint=NAME] [at=S] [duration=S] [size=X] [offset=X,Y,Z]`.
+    """Parse a fault, `KIND [joint=NAME] [at=S] [duration=S] [size=X] [offset=X,Y,Z]`; DriverError for a wrong one.
 
     Args:
         text: the words.

@@ -246,17 +246,17 @@ class LockStepLink:
         return self.arm.clock
 
     def send(self, frame: Frame) -> None:
-        """Send a frame: drives receive it now, and it occupies the bus for its duration; DriverError on a dead bus."""
+        """Send a frame: drives receive it now, and it occupies the bus for a while; DriverError if closed or gone."""
         self._require_open()
         self.arm.send(self._bus, frame)
 
     def receive(self, deadline_ns: int) -> Frame | None:
-        """Return the next frame, moving the time to it, or None at the deadline; raises DriverError on a dead bus."""
+        """Return the next frame, moving the time to it, or None at the deadline; DriverError if closed or gone."""
         self._require_open()
         return self.arm.receive(self._bus, deadline_ns)
 
     def drain(self) -> list[Frame]:
-        """Return all frames that came until now; raises DriverError on a dead bus."""
+        """Return all frames that came until now; DriverError if the link is closed or the bus gone."""
         self._require_open()
         return self.arm.drain(self._bus)
 

@@ -77,7 +77,7 @@ class PythonCanBuses:
 
     @property
     def waits(self) -> bool:
-        """Return whether a received frame is queued already, so that `receive` returns at once."""
+        """Return whether a received frame is queued already, so that `receive` returns at once; False with one bus."""
         return not self._heard.empty()
 
     def receive(self, timeout: float) -> tuple[int, Frame] | None:
@@ -212,7 +212,7 @@ class HostedBuses:
         return self._heard.popleft() if self._heard else None
 
     def send(self, frames: Iterable[tuple[int, Frame]]) -> None:
-        """Send frames, those of a bus in one packet; frames that a bus does not take count as `unsent`."""
+        """Send frames, those of one bus together; frames that a bus does not take count as `unsent`."""
         of: dict[int, list[Frame]] = {}
         for number, frame in frames:
             of.setdefault(number, []).append(frame)

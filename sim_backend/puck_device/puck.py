@@ -141,7 +141,7 @@ class EmulatedPuck:
         return Traffic.FEEDBACK if address.group and address.destination == Group.POSITIONS else Traffic.OTHER
 
     def receive(self, frame: Frame, now_ns: int) -> list[Frame]:
-        """Process a host's frame: set torques or a property, or return the answer to a GET."""
+        """Process a frame of host or safety puck: take a torque or set a property, or return the answer to a GET."""
         if frame.error or frame.remote or frame.extended:
             return []
         address = address_of(frame.identifier)

@@ -26,7 +26,7 @@ from sim_backend import wire
 from sim_backend.arm import SimulatedArm, from_config
 from sim_backend.faults import Fault, FaultKind
 from sim_backend.plant_status import PlantState
-from sim_backend.remote_arm import RemoteArm, address_of, connect
+from sim_backend.remote_arm import RemoteArm, connect_to_plant, plant_address
 
 LIMIT = np.array([40.0, 15.0])
 
@@ -299,7 +299,7 @@ def test_what_acts_in_real_time_is_what_the_samples_say():
 
 
 def stranger(arm):
-    sock = connect(arm._address)
+    sock = connect_to_plant(arm._address)
     assert sock is not None
     sock.settimeout(10.0)
     return sock
@@ -360,9 +360,9 @@ def test_somebody_elses_answers_are_refused(monkeypatch):
     bus = f"liar-{os.getpid()}"
     arm = from_config(remote_config(bus=bus))
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as liar:
-        liar.bind("\0" + address_of(bus))
+        liar.bind("\0" + plant_address(bus))
         liar.listen()
-        with connect(address_of(bus)):
+        with connect_to_plant(plant_address(bus)):
             peer, _ = liar.accept()
             peer.close()
         monkeypatch.setattr("sim_backend.remote_arm.START_TIMEOUT", 0.2)
