@@ -234,18 +234,15 @@ def error_of(kind: str, message: str, dependents: Sequence[Mapping[str, Any]] = 
         return errors.InUse(message, [errors.Dependent(**one) for one in dependents])
     if kind == errors.ConfigError.__name__:
         return errors.ConfigError(list(_problems(message)))
-    if kind == errors.RecordingError.__name__:
-        path, _, words = message.partition(": ")
-        return errors.RecordingError(path, words)
-    if kind == errors.ArmFault.__name__:
-        code, _, words = message.partition(": ")
-        return errors.ArmFault(code, words)
     if kind == errors.SolverError.__name__:
         problem, _, status = message.partition(": the solver stopped with status ")
         return errors.SolverError(problem, status)
     found = _OF_HTTP.get(kind) or getattr(errors, kind, None)
     if not (isinstance(found, type) and issubclass(found, errors.IdentError)):
         found = errors.IdentError
+    if issubclass(found, errors.RecordingError | errors.StorageError | errors.ArmFault):
+        about, _, words = message.partition(": ")
+        return found(about, words)
     return found(message)
 
 

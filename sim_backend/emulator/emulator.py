@@ -232,7 +232,8 @@ class Emulator:
         self._configured += tuple(faults)
 
     def clear(self, now_ns: int) -> None:
-        """End acting faults with the next `tick` and drop scheduled ones; those that wait for the first SYNC stay."""
+        """End acting faults with the next `tick`, and drop those that are to begin."""
+        self._configured = ()
         self._to_begin.clear()
         self._to_end = [(now_ns, fault) for fault in self._injection.active]
         self._deadline = None

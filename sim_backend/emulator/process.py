@@ -56,7 +56,7 @@ class PythonCanBuses:
         """
         self._buses: list[can.BusABC] = []
         self._fd = [bus.data_bitrate is not None for bus in buses]
-        self._heard: queue.SimpleQueue[tuple[int, can.Message]] = queue.SimpleQueue()
+        self._heard: queue.SimpleQueue[tuple[int, can.Message | DriverError]] = queue.SimpleQueue()
         self._closing = False
         self.unsent = 0
         for number, bus in enumerate(buses):
@@ -125,6 +125,8 @@ class PythonCanBuses:
                 number, message = self._heard.get(timeout > 0.0, timeout or None)
             except queue.Empty:
                 return None
+            if isinstance(message, DriverError):
+                raise message
         else:
             number, message = 0, self._received(0, timeout)
         return None if message is None else (number, message)
@@ -139,7 +141,8 @@ class PythonCanBuses:
         while not self._closing:
             try:
                 message = self._received(number, 0.05)
-            except DriverError:
+            except DriverError as error:
+                self._heard.put((number, error))
                 return
             if message is not None:
                 self._heard.put((number, message))

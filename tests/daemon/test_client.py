@@ -33,8 +33,10 @@ from ident_service.errors import (
     PersonNeeded,
     Problem,
     RecordingError,
+    RecordingNotWritten,
     SolverError,
     Stopped,
+    StorageError,
     UnknownId,
     UsageError,
 )
@@ -271,6 +273,8 @@ def test_every_kind_that_the_api_tells_is_an_error_of_the_tree() -> None:
     [
         ConfigError([Problem(Path("arm.yaml"), 3, 7, "a: b\nand more"), Problem(Path("x.eds"), 1, 1, "c")]),
         RecordingError("a.csv", "line 3: torn"),
+        RecordingNotWritten("run.mcap", "No space left on device"),
+        StorageError("s3://bucket/x", "cannot be reached"),
         SolverError("weights", "infeasible"),
         ArmFault("late_cycle", "a cycle came late"),
         PersonNeeded("look"),

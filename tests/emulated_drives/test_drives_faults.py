@@ -42,6 +42,12 @@ def test_lost_feedback(enabled: Host) -> None:
     assert [set(enabled.cycle(0, 0)) for _ in range(4)] == [{2}, {2}, {2}, {1, 2}]
 
 
+def test_faults_that_are_cleared_before_the_first_sync_do_not_begin(enabled: Host) -> None:
+    enabled.arm.emulator.add_configured([parse_fault("lost_feedback joint=shoulder", NAMES)])
+    enabled.arm.emulator.clear(enabled.now)
+    assert [set(enabled.cycle(0, 0)) for _ in range(3)] == [{1, 2}] * 3
+
+
 def test_delayed_feedback_arrives_after_the_others(enabled: Host) -> None:
     inject(enabled, "delayed_feedback joint=shoulder size=0.0015")
     truth = round(true_counts(enabled)[0])

@@ -13,6 +13,7 @@ import pytest
 from canopen.profiles.p402 import BaseNode402
 from drives_bench import EDS, drives_config
 
+from ident_service.errors import DriverError
 from sim_backend.emulator.process import Emulated, emulate
 
 CHANNEL = "drives-foreign"
@@ -160,4 +161,23 @@ def test_frames_are_of_the_kind_they_were_sent_as() -> None:
         other.send(can.Message(arbitration_id=0x7FF, is_remote_frame=True, is_extended_id=False))
         assert station.receive(1.0) == (0, Frame(0x7FF, remote=True))
         assert station.receive(0.0) is None
+        station.close()
+
+
+def test_one_of_two_interfaces_that_is_gone_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    from ident_service.config.can_bus import CanBus
+    from sim_backend.emulator.process import PythonCanBuses
+
+    buses = [CanBus(interface="virtual", channel=f"drives-gone-{number}") for number in range(2)]
+    station = PythonCanBuses(buses)
+    try:
+        assert station.receive(0.0) is None
+
+        def unplugged(timeout: float | None = None) -> None:
+            raise can.CanOperationError("unplugged")
+
+        monkeypatch.setattr(station._buses[1], "recv", unplugged)
+        with pytest.raises(DriverError, match="bus 1 is gone: unplugged"):
+            station.receive(10.0)
+    finally:
         station.close()
