@@ -264,7 +264,7 @@ def split(parts: Sequence[Part], z: Array) -> list[Array]:
 
 
 def central_path(parts: Sequence[Part], objective: Array, interior_point: Array, normals: Array) -> Iterator[Array]:
-    """Yield points of the central path that minimises `objective` over the cone, only negative ones, to the optimum.
+    """Yield points of the central path to the least `objective` over the cone, only those where it is negative.
 
     Args:
         parts: the cone.
