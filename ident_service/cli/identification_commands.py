@@ -146,7 +146,7 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
             folder,
             motion=None if arguments.motion is None else read_excitation(arguments.motion),
             set_name=arguments.feasible_set,
-            described=described,
+            config_as_read=described,
             custom=custom_of(arguments.arm, described),
             tell=lambda line: tell(arguments, line),
             step=step_of(arguments),

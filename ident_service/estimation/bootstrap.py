@@ -80,7 +80,7 @@ def bootstrap(
     level: float = 0.95,
     progress: Progress = lambda _done, _all: None,
 ) -> Bootstrap:
-    """Repeat the estimate for resampled blocks; return the repeats' covariance and percentile intervals.
+    """Repeat the constrained estimate, or `solve`, on resampled blocks; return its covariance and percentile intervals.
 
     Args:
         equations: equations that `fit` solves, in blocks of time.

@@ -264,7 +264,7 @@ def split(parts: Sequence[Part], z: Array) -> list[Array]:
 
 
 def central_path(parts: Sequence[Part], objective: Array, interior_point: Array, normals: Array) -> Iterator[Array]:
-    """Yield points of the central path that minimises `objective` over the cone, only negative ones, to the optimum.
+    """Yield points of the central path to the least `objective` over the cone, only those where it is negative.
 
     Args:
         parts: the cone.
@@ -361,22 +361,22 @@ _LONGEST_DIRECTION = 1e4
 _INTERIOR = 1e-9
 
 
-def dual_candidates(blocks: Sequence[Block], null: Array, delta: Array) -> Iterator[list[Array]]:
+def dual_candidates(blocks: Sequence[Block], null_directions: Array, delta: Array) -> Iterator[list[Array]]:
     """Yield approximate multipliers that prove infeasibility, most negative value first; none if none is found.
 
     Args:
         blocks: the conditions.
-        null: directions d with `K d = 0`, shape (parameters, directions).
+        null_directions: directions d with `K d = 0`, shape (parameters, directions).
         delta: any link parameters with `K delta = beta`, shape (parameters,).
 
     Yields:
         Per block its multiplier, shape (entries,): upper triangles column by column. They satisfy the equations up to
         rounding and lie strictly inside the cone of what facial reduction left.
     """
-    parts = _reduce(blocks, null)
+    parts = _reduce(blocks, null_directions)
     if not parts:
         return
-    A = np.vstack([blocks[p.block].F[list(p.entries)] @ null * p.scale[:, None] for p in parts])
+    A = np.vstack([blocks[p.block].F[list(p.entries)] @ null_directions * p.scale[:, None] for p in parts])
     c = np.concatenate([(blocks[p.block].F @ delta + blocks[p.block].f)[list(p.entries)] * p.scale for p in parts])
     trace = np.concatenate([identity(p) for p in parts])
     lengths = np.linalg.norm(A, axis=0)

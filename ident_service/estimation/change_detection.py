@@ -284,7 +284,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def torque_shares(first: ComparedEstimate, second: ComparedEstimate, difference: Array) -> tuple[Array, Array] | None:
-    """Return RMS torque changes of a parameter difference as shares of torque, and of residual; None without a motion.
+    """Return RMS torque changes by a difference, in second's (else first's) motion, over torque and residual; or None.
 
     Returns:
         Per joint, root mean square of the change over that of the torque, and over that of what the parameters

@@ -509,17 +509,17 @@ def fit_friction(
     return with_friction(model, _shape(values)), tuple(choices)
 
 
-def at_search_bounds(shape: FrictionShape, joints: Sequence[str], terms: Sequence[str]) -> tuple[str, ...]:
-    """Return a message per fitted friction number that lies at an end of its search range; empty for none.
+def at_search_bounds(shape: FrictionShape, joints: Sequence[str], joint_terms: Sequence[str]) -> tuple[str, ...]:
+    """Return a message per number of a fitted friction shape at an end of its search range; empty for none.
 
     Args:
         shape: fitted shape of the friction.
         joints: names of the joints.
-        terms: terms of the model's joints; without Stribeck friction its velocity means nothing.
+        joint_terms: terms of the model's joints; without Stribeck friction its velocity means nothing.
     """
     found = []
     for key, what in (("presliding", "pre-sliding distance"), ("stribeck_velocity", "Stribeck velocity")):
-        if key == "stribeck_velocity" and "stribeck" not in terms:
+        if key == "stribeck_velocity" and "stribeck" not in joint_terms:
             continue
         grid = _GRIDS[key]
         for name, value in zip(joints, np.broadcast_to(np.asarray(getattr(shape, key)), len(joints)), strict=True):

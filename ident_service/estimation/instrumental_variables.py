@@ -256,14 +256,14 @@ class SimulatedRecording:
             yield replace(block, position=position, velocity=None)
 
 
-def simulated(recording: Recording, model: ArmModel, delta: Array, cutoff: float) -> SimulatedRecording:
+def simulated(recording: Recording, model: ArmModel, delta: Array, position_cutoff: float) -> SimulatedRecording:
     """Return the recording with the positions of a simulated, noise-free arm that follows it; torques stay.
 
     Args:
         recording: recording whose positions the simulated arm follows, and whose stamps and torques are kept.
         model: the arm; its configuration says what to trim.
         delta: link parameters of the arm, shape (parameters,).
-        cutoff: cut-off of the low-pass on the positions [Hz].
+        position_cutoff: cut-off of the low-pass on the positions [Hz].
 
     Raises:
         ModelError: a link has no positive mass, the loop runs away, or a cut-off above half the rate.
@@ -271,8 +271,8 @@ def simulated(recording: Recording, model: ArmModel, delta: Array, cutoff: float
     """
     fmt = model.config.recording
     stamps = grid(recording, fmt)
-    if not 0.0 < cutoff < 0.5 / stamps.period_s:
-        raise ModelError(f"a cut-off of {cutoff:g} Hz at {1.0 / stamps.period_s:.4g} Hz is not possible")
+    if not 0.0 < position_cutoff < 0.5 / stamps.period_s:
+        raise ModelError(f"a cut-off of {position_cutoff:g} Hz at {1.0 / stamps.period_s:.4g} Hz is not possible")
     loop = _Loop(model, delta, stamps.period_s)
     held: list[Block] = []
     stretches = []
@@ -282,8 +282,8 @@ def simulated(recording: Recording, model: ArmModel, delta: Array, cutoff: float
             whole = join(held)
             held = []
             if len(whole.stamp_ns) > 1:
-                pad = min(3 * int(1.0 / (cutoff * stamps.period_s)), len(whole.stamp_ns) - 1)
-                position = low_pass(whole.position, _ORDER, cutoff, 1.0 / stamps.period_s, pad)
+                pad = min(3 * int(1.0 / (position_cutoff * stamps.period_s)), len(whole.stamp_ns) - 1)
+                position = low_pass(whole.position, _ORDER, position_cutoff, 1.0 / stamps.period_s, pad)
                 stretches.append((whole.stamp_ns, loop.follow(position)))
     return SimulatedRecording(recording, stretches)
 

@@ -76,7 +76,7 @@ class Objections:
 
 
 def reasons_against(estimate: Estimate, recordings: Sequence[Recording] = ()) -> tuple[str, ...]:
-    """Return sentences on why an estimate cannot be right, judged by its torque errors; empty where no reason is found.
+    """Return sentences on why an estimate cannot be right: misread columns or gravity, torque errors; () for none.
 
     The words name the most likely cause where the numbers tell one.
 

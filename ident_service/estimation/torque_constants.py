@@ -86,7 +86,7 @@ class TorqueConstants:
     applied: Array
 
     def of(self, model: ArmModel) -> ArmModel:
-        """Return a model of the arm that multiplies recorded motor torques by these factors."""
+        """Return the arm with these factors of recorded motor torques, multiplied by those it was described with."""
         return model.with_options(torque_factors=tuple((self.applied * self.factors).tolist()))
 
     def uncertainty(self) -> ShapeUncertainty:

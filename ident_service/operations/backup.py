@@ -137,7 +137,7 @@ def _full(file: Path) -> DiskFull:
 
 
 def restore(backup_file: Path, state: Path, who: str, *, replace: bool = False) -> Backup:
-    """Restore a backup into a state folder, upgraded to this software; all is checked before anything changes.
+    """Restore a checked backup, upgraded, into an empty state folder; `replace` moves old content into a subfolder.
 
     Args:
         backup_file: the backup.

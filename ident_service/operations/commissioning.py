@@ -233,7 +233,7 @@ def simulate(
     *,
     motion: Excitation | None = None,
     set_name: SetName | None = None,
-    described: ArmConfig | None = None,
+    config_as_read: ArmConfig | None = None,
     custom: CustomFunction | None = None,
     tell: Tell = lambda _: None,
     step: Step = lambda words, share: None,
@@ -246,7 +246,7 @@ def simulate(
         folder: the run folder; it appears when everything is in it, and must not exist.
         motion: motion to identify from, a designed one for example; the description's when None.
         set_name: feasible set, the configuration's when None.
-        described: the configuration as it was read, where it was changed since; `config` when None.
+        config_as_read: the configuration as it was read, where it was changed since; `config` when None.
         custom: the function that its `constraints.custom` names.
         tell: called with a line at each step.
         step: called with what is being done and how much of all is done, from 0 to 1.
@@ -319,7 +319,7 @@ def simulate(
             estimate,
             {"warnings": warnings},
             objections.reasons,
-            described=config if described is None else described,
+            described=config if config_as_read is None else config_as_read,
         )
         write_atomically(staging / "score.json", json.dumps(score_document(scored), indent=1) + "\n")
         write_report(staging, estimate, recordings[:1], recordings[1:], warnings)

@@ -59,7 +59,7 @@ def describe_apart(urdf_file: Path, name: str) -> dict[str, Any]:
 
 
 def draw_apart(description_file: Path, mesh_folder: Path, new_folder: Path) -> None:
-    """Make triangles of an uploaded arm's meshes in a separate process: `OUT/JOINT.f32`, and `drawn.json` beside them.
+    """Make triangles of an uploaded arm's meshes in a separate process: JOINT.f32 and `drawn.json` in `new_folder`.
 
     Args:
         description_file: the description.

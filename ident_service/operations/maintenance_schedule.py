@@ -39,7 +39,7 @@ class Cron:
     text: str
 
     def after(self, seconds: float) -> float:
-        """Return the first time after `seconds` that the five fields match; both [s since 1970 in UTC].
+        """Return the first time after `seconds` that the five fields match in UTC; both times [s since 1970 in UTC].
 
         Raises:
             UsageError: no such day comes within fifty years.

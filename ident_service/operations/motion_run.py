@@ -89,7 +89,7 @@ class ProcessResult:
         return bool(self.report or self.error)
 
     def raise_for(self, faults: FaultStore) -> None:
-        """Raise the motion process's error, or how it died, with the faults latched; return if it reported a run.
+        """Raise the motion process's error, or how it died, naming faults already latched; return if it reported a run.
 
         Raises:
             ArmFault: the fault that was latched first, which is the cause of the others.

@@ -187,12 +187,12 @@ def _ended(whole: McapRecording | MeasuredRecording, recording: Recording) -> fl
 
 
 def own_formats(
-    columns: Mapping[Path, Path], recordings: Sequence[Path], model: ArmModel
+    columns_files: Mapping[Path, Path], recordings: Sequence[Path], model: ArmModel
 ) -> dict[Path, RecordingFormat]:
-    """Read the columns files that each belong to one recording; map the recording to its format.
+    """Read each recording's own columns file, `columns_files` by recording; return the formats by recording.
 
     Args:
-        columns: the columns file of each recording.
+        columns_files: the columns file of each recording that has one.
         recordings: all that are read, as they were named.
         model: the arm.
 
@@ -204,7 +204,7 @@ def own_formats(
         ConfigError: mistakes in a columns file.
     """
     found: dict[Path, RecordingFormat] = {}
-    for wanted, file in columns.items():
+    for wanted, file in columns_files.items():
         named = [path for path in recordings if wanted in (path, file_and_range(path)[0])]
         if not named:
             raise UsageError(f"--columns {wanted}={file}: {wanted} is none of the recordings")
@@ -223,11 +223,13 @@ def own_formats(
     return found
 
 
-def known_payloads(files: Mapping[Path, Path], recordings: Sequence[Path], model: ArmModel) -> dict[Path, Payload]:
-    """Read the files of known payloads; map each recording that has one to its payload.
+def known_payloads(
+    payload_files: Mapping[Path, Path], recordings: Sequence[Path], model: ArmModel
+) -> dict[Path, Payload]:
+    """Read the files of known payloads, `payload_files` by recording; return the payloads by recording.
 
     Args:
-        files: file of each recording that has one: YAML with the keys of a description's section `payload`.
+        payload_files: file of each recording that has one: YAML with the keys of a description's section `payload`.
         recordings: all that are read, as they were named.
         model: the arm.
 
@@ -239,7 +241,7 @@ def known_payloads(files: Mapping[Path, Path], recordings: Sequence[Path], model
         ConfigError: mistakes in a file.
     """
     found: dict[Path, Payload] = {}
-    for wanted, file in files.items():
+    for wanted, file in payload_files.items():
         named = [path for path in recordings if wanted in (path, file_and_range(path)[0])]
         if not named:
             raise UsageError(f"--payload {wanted}={file}: {wanted} is none of the recordings")

@@ -94,7 +94,7 @@ class PrunableRecording:
 
 
 def prunable_recordings(db: Database, state: Path, runs_to_keep: int) -> list[PrunableRecording]:
-    """Return the recordings that `prune` would delete: of older runs, needed by no acceptance and no job.
+    """Return the recordings that `prune` would delete: all but those of each arm's newest runs, acceptances, live jobs.
 
     Kept are those of accepted runs, those of other runs that an accepted set was identified from or judged on, those of
     each arm's `runs_to_keep` runs, and those that a waiting or running job makes or reads.

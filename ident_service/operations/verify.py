@@ -42,10 +42,11 @@ def verify_file(certified_file: Path, description: str | None = None) -> Verific
         raise UsageError(f"{error.filename or certified_file}: {error.strerror or error}") from None
 
 
-def custom_note(arm_name: str) -> str:
-    """Return the note that an answer about an arm leaves out its `constraints.custom`."""
+def custom_note(function_name: str) -> str:
+    """Return the note that an answer leaves out the function that `constraints.custom` of the description names."""
     return (
-        f"constraints.custom ({arm_name}) of the description is code that only identify and simulate run; left out here"
+        f"constraints.custom ({function_name}) of the description is code that only identify and simulate run; "
+        "left out here"
     )
 
 

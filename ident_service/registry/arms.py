@@ -176,7 +176,7 @@ def _description_folder(state: Path, name: str, sha256: str) -> Path:
 
 
 def drawn_meshes(state: Path, config: ArmConfig) -> dict[str, Any]:
-    """Return the arm's `joints` that `mesh_bytes` has triangles of, and `notes`; both empty without meshes."""
+    """Return `joints` (count of triangles in `mesh_bytes`, by joint number) and `notes`; both empty without meshes."""
     try:
         text = (_description_folder(state, config.name, config.sha256) / _DRAWN / DRAWN_LIST).read_text("utf-8")
     except FileNotFoundError:
@@ -186,7 +186,7 @@ def drawn_meshes(state: Path, config: ArmConfig) -> dict[str, Any]:
 
 
 def mesh_bytes(state: Path, arm: str, sha256: str, joint: int) -> bytes:
-    """Return the meshes of a joint's link as triangles in its frame [m]: nine little-endian 32-bit floats each.
+    """Return the meshes of a joint (-1: the base) as triangles in its frame [m]: nine little-endian 32-bit floats each.
 
     Args:
         state: the state folder.

@@ -432,7 +432,7 @@ class Database:
     def newest(
         self, table: str, noun: str, time_column: str, arm: str | None, before_id: str | None, max_rows: int
     ) -> list[Row]:
-        """Return at most `max_rows` rows, or those of an arm, the newest first, from the one older than `before_id`.
+        """Return at most `max_rows` rows, or those of an arm, the newest first, all older than row `before_id`.
 
         Args:
             table: table of the rows.

@@ -80,5 +80,5 @@ def motions(db: Database, arm: str | None = None, *, before: str | None = None, 
 
 
 def motion_path(db: Database, state: Path, motion: str) -> Path:
-    """Return the path of a motion's file, by the id in the registry, never by a word of the request; or UnknownId."""
+    """Return the path of a motion's file, from the registry's id and no text of a request; raise UnknownId for none."""
     return state / MOTIONS / str(known_motion(db, motion)["id"]) / MOTION_FILE

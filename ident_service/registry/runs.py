@@ -198,7 +198,7 @@ def shown_labels(labels: Mapping[str, Row], run: str) -> dict[str, Any]:
 
 
 def run_folder(db: Database, state: Path, run: str) -> Path:
-    """Return the path of a run's folder, by the id in the registry, never by a word of the request; or UnknownId."""
+    """Return the path of a run's folder, from the registry's id and no text of a request; raise UnknownId for none."""
     return state / RUNS / str(known_run(db, run)["id"])
 
 

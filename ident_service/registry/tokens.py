@@ -85,7 +85,7 @@ def access(db: Database, token: str) -> Access | None:
 
 
 def begin_session(db: Database, session_word: str, token: str, ends_at: float, max_sessions: int) -> None:
-    """Store a session of the page; sessions that have ended, and the first to end over `max_sessions`, are deleted.
+    """Store a session of the page; of all sessions, ended ones and the first to end over `max_sessions` are deleted.
 
     Args:
         db: the registry.

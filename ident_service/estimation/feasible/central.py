@@ -86,7 +86,7 @@ def centre(
     likely: LikelyBodies | None = None,
     allowed_change: ChangeEllipsoid | None = None,
 ) -> Array:
-    """Return link parameters moved to the set's centre near likely bodies, base parameters within `allowed_change`.
+    """Return link parameters moved to the set's centre near likely bodies; base ones move only in `allowed_change`.
 
     Args:
         delta: inside the feasible set (margin above 0), SI units, shape (parameters,).

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from ident_service.errors import SolverError
 from ident_service.model.chain import Array
 
-Columns = Literal["unit", "orthonormal"]
+ColumnScaling = Literal["unit", "orthonormal"]
 
 _RANK = 1e-12  # of the largest singular value: below it, a direction that no constraint feels
 _FLOOR = 1e-6  # of the largest eigenvalue: scaling by smaller ones would magnify rounding
@@ -81,18 +81,19 @@ class ScaledProblem:
 
 
 def precondition(
-    rows: Sequence[Rows], objective: Array, hessian: Array, around: Array, columns: Columns | None
+    rows: Sequence[Rows], objective: Array, hessian: Array, around: Array, column_scaling: ColumnScaling | None
 ) -> ScaledProblem:
-    """Return the conic problem rescaled around a point for better conditioning; unchanged where `columns` is None.
+    """Return the conic problem rescaled around a point for better conditioning; unchanged if `column_scaling` is None.
 
     Args:
         rows: constraints.
         objective: linear coefficients, shape (variables,).
         hessian: diagonal of the quadratic part, shape (variables,).
         around: x0, shape (variables,).
-        columns: C makes the constraints' columns of unit length, or orthonormal; None leaves everything as it is.
+        column_scaling: whether C makes the constraints' columns of unit length, or orthonormal; None leaves everything
+            as it is.
     """
-    if columns is None:
+    if column_scaling is None:
         n = len(objective)
         ones = tuple(np.ones(len(block.f)) for block in rows)
         return ScaledProblem(list(rows), objective, hessian, np.zeros(n), np.ones(n), ones, 1.0)
@@ -102,7 +103,7 @@ def precondition(
     stacked = np.vstack(F)
     norms = np.linalg.norm(stacked, axis=0)
     C = 1.0 / np.where(norms > 0.0, norms, 1.0)
-    if columns == "orthonormal":
+    if column_scaling == "orthonormal":
         triangle = np.linalg.qr(stacked * C, mode="r")
         _, values, right = np.linalg.svd(np.vstack([triangle, np.zeros((len(C) - len(triangle), len(C)))]))
         C = C[:, None] * right.T / np.where(values > _RANK * values[0], values, 1.0)
@@ -203,7 +204,7 @@ class _SolverAttempt:
 
     step: float
     equilibrations: int
-    around: Columns | None = None
+    column_scaling: ColumnScaling | None = None
 
 
 # Distances of a thousandth and margins of a millionth are results here: 1e-9 first, in every pose. The looser ones are
@@ -280,13 +281,13 @@ class ConicProblem:
         around = np.zeros(self.variables)
         status, attempts, iterations, seconds = "", 0, 0, 0.0
         # Orthonormal coordinates make every constraint one of all variables, which costs twenty times as much.
-        close = [attempt for attempt in _POSES if not (self.rough and attempt.around == "orthonormal")]
+        close = [attempt for attempt in _POSES if not (self.rough and attempt.column_scaling == "orthonormal")]
         tolerances = _TOLERANCES[-1:] if self.rough else _TOLERANCES
         if sufficient_tolerance is not None:
             close, tolerances = close[:1], (sufficient_tolerance,)
         for tolerance in tolerances:
             for attempt in tuple(close):
-                pose = precondition(self._rows, objective, hessian, around, attempt.around)
+                pose = precondition(self._rows, objective, hessian, around, attempt.column_scaling)
                 result = _solve(pose, attempt, tolerance)
                 attempts, iterations = attempts + 1, iterations + result.iterations
                 seconds += result.solve_time
@@ -296,11 +297,11 @@ class ConicProblem:
                     duals = self._duals(pose, np.array(result.z))
                     return Solution(x, duals, value, iterations, seconds, tolerance, attempts)
                 status = status or str(result.status)
-                if result.status in _FINAL and attempt.around is None:
+                if result.status in _FINAL and attempt.column_scaling is None:
                     raise SolverError(problem_name, str(result.status))
                 if result.status != clarabel.SolverStatus.AlmostSolved:
                     close.remove(attempt)
-                if attempt.around is None and np.all(np.isfinite(x)):
+                if attempt.column_scaling is None and np.all(np.isfinite(x)):
                     around = x
         raise SolverError(problem_name, status)
 

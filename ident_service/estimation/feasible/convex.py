@@ -368,7 +368,7 @@ def second_opinion(
     custom: CustomFunction | None = None,
     solver: str | None = None,
 ) -> SecondOpinion:
-    """Solve the problem of `first` again with another solver; return how far the two solutions are apart.
+    """Solve the problem of `first` again, through cvxpy by another solver; return how far the solutions are apart.
 
     Args:
         first: the estimate; with `custom` it was found through cvxpy, by `solver`.

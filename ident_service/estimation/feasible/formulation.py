@@ -93,7 +93,7 @@ def minimise(
     trace_bounds: Sequence[float] = OF_TESTS,
     first_tolerance: float | None = None,
 ) -> Solution:
-    """Minimise an objective; return the first acceptable optimum among `trace_bounds` on the links' tr(P).
+    """Minimise an objective under `trace_bounds` on links' tr(P), in turn; return the first whose x `accept` takes.
 
     Args:
         problem: problem with all its constraints.

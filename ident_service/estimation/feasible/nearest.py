@@ -69,15 +69,15 @@ class FeasibleEstimate:
         likely: LikelyBodies | None = None,
         allowed_change: ChangeEllipsoid | None = None,
     ) -> FeasibleEstimate:
-        """Return the estimate with link parameters centred near likely ones, base parameters in `allowed_change`."""
+        """Return the estimate with link parameters near likely ones; base ones move only in `allowed_change`."""
         delta = centre(self.delta, base, conditions, likely, allowed_change)
         beta = self.beta if allowed_change is None else base.K @ delta
         return replace(self, beta=beta, delta=delta, margin=conditions.margin(delta)[0])
 
 
-def add_conditions(problem: ConicProblem, conditions: FeasibleSet, to_delta: Array, inside: Array) -> None:
-    """Add the set's conditions to a problem, delta = to_delta x: blocks with insets (eq. 21), equalities exactly."""
-    for block, inset in zip(conditions.blocks, inside, strict=True):
+def add_conditions(problem: ConicProblem, conditions: FeasibleSet, to_delta: Array, block_insets: Array) -> None:
+    """Add a set's conditions to a problem, delta = to_delta x: blocks by their insets (eq. 21), equalities exactly."""
+    for block, inset in zip(conditions.blocks, block_insets, strict=True):
         constrain(problem, block, block.times(to_delta), block.f - inset * block.identity())
     E, e = conditions.equality_rows()
     if len(e):

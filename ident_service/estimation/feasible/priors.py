@@ -74,7 +74,7 @@ class Prior:
 
     @cached_property
     def euclidean(self) -> NDArray[np.intp]:
-        """Return indices of parameters compared by squared difference: all if `euclidean`, else those of joints."""
+        """Return indices of parameters compared by squared difference: all for kind `euclidean`, else joints'."""
         inertial = [name.rstrip("0123456789") in INERTIAL for name in self.names]
         return np.flatnonzero(np.ones(len(self.names)) if self.kind == "euclidean" else ~np.array(inertial))
 
@@ -101,7 +101,7 @@ class Prior:
         return tuple(blocks)
 
     def divergence(self, delta: Array) -> float:
-        """Return the divergence of delta from the prior; infinite outside positive pseudo-inertias if `entropic`."""
+        """Return the divergence of delta from the prior; for `entropic`, infinite outside positive pseudo-inertias."""
         columns = self.euclidean
         total = float(np.sum(((delta - self.delta)[columns] / self.scales[columns]) ** 2))
         if self.kind == "entropic":

@@ -64,7 +64,7 @@ def constrained_least_squares_with_scales(
     bounds: Bounds,
     weights: Array | None = None,
 ) -> ScaledEstimate:
-    """Return the feasible base parameters, and bounded torque factors, that explain the torques best.
+    """Return feasible base parameters and bounded torque factors that explain torques best; `weights` are 1 if None.
 
     Where every joint is free the residual shrinks with all factors together, so they end at lower bounds; at least one
     fixed joint makes the factors mean something.
@@ -95,16 +95,16 @@ def constrained_least_squares_with_scales(
 
 
 def feasible_with_factors(
-    R: Array, base: BaseParameters, conditions: FeasibleSet, start_factors: Array, bounds: tuple[Array, Array]
+    R: Array, base: BaseParameters, conditions: FeasibleSet, expected_beta: Array, bounds: tuple[Array, Array]
 ) -> tuple[FeasibleEstimate, Array]:
-    """Return the feasible base parameters and the bounded factors that minimise |R [beta; factors; 1]|.
+    """Return the feasible base parameters beta and the bounded factors that minimise |R [beta; factors; 1]|.
 
     Args:
         R: triangular factor, one column a base parameter, one a factor, and one of constants, shape (rows, base +
             factors + 1).
         base: grouping of the parameters.
         conditions: the feasible set.
-        start_factors: base parameters of the size that is to be expected, shape (base,).
+        expected_beta: base parameters of the size that is to be expected, shape (base,).
         bounds: smallest and largest factors, shape (factors,) each.
 
     Raises:
@@ -126,14 +126,14 @@ def feasible_with_factors(
     to_delta = np.zeros((len(base.names), variables))
     to_delta[:, :n] = lift.of_beta
     to_delta[:, n : factors.start] = lift.of_dependent
-    add_conditions(problem, conditions, to_delta, insets(conditions, base, start_factors))
+    add_conditions(problem, conditions, to_delta, insets(conditions, base, expected_beta))
     if free:
         pick = np.zeros((free, variables))
         pick[:, factors] = np.eye(free)
         problem.nonnegative(np.vstack([pick, -pick]), np.concatenate([-lower, upper]))
     objective = np.append(np.zeros(variables - 1), 1.0)
     name = "constrained least squares with torque scales"
-    size = float(np.max(np.abs(start_factors), initial=0.0))
+    size = float(np.max(np.abs(expected_beta), initial=0.0))
     delta, solution = solve_inside(problem, objective, name, to_delta, conditions, size)
     beta = base.K @ delta
     residual = R @ np.concatenate([beta, solution.x[factors], [1.0]])
