@@ -197,7 +197,7 @@ class Prover:
         best: Attempt | None = None,
         task: Task | None = None,
     ) -> Attempt | None:
-        """Prove candidates, best first, searching on or shrinking if that fails; return the best, even if unproven.
+        """Prove candidates, best first, searching on or shrinking if it fails; return the best, if any, even unproven.
 
         Args:
             candidates: candidates of the search. Their values are of a smoothed criterion; the exact one, used here,
