@@ -64,7 +64,7 @@ def add(verbs: VerbList) -> None:
         examples=("", "--most 50", "--server http://127.0.0.1:8470"),
     )
     jobs.parser.add_argument("--most", type=count, default=20, metavar="N", help="of the newest (default: 20)")
-    sub = jobs.add("list", listed, "list jobs, the newest first", hidden=True, word="jobs")
+    sub = jobs.add("list", listed, "list jobs, the newest first", hidden=True, stands_for="jobs")
     sub.add_argument("--most", type=count, default=20, metavar="N")
     for name, verb, text, more in (
         ("show", _show, "show one job and its result", ""),

@@ -146,14 +146,14 @@ def implausible_links(estimate: Estimate) -> tuple[str, ...]:
 
 
 def summary(
-    estimate: Estimate, unusable: Sequence[str] = (), torque: str = "commanded", warnings: Sequence[str] = ()
+    estimate: Estimate, unusable: Sequence[str] = (), torque_kind: str = "commanded", warnings: Sequence[str] = ()
 ) -> str:
     """Describe an estimate in lines no wider than a terminal: verdict, reasons, a row per joint, then details.
 
     Args:
         estimate: estimate to describe.
         unusable: reasons why it must not be used, which come first.
-        torque: kind of torque in the recordings: `measured`, `commanded`, or `recorded` by another program.
+        torque_kind: kind of torque in the recordings: `measured`, `commanded`, or `recorded` by another program.
         warnings: what is wrong with the recordings, in words.
     """
     own = estimate.candidates[estimate.chosen]
@@ -163,7 +163,7 @@ def summary(
         "",
         "Details",
         f"{estimate.model.config.name}: {estimate.base.size} base parameters of {len(estimate.base.names)} link "
-        f"parameters, from {estimate.samples} samples of {torque} torque",
+        f"parameters, from {estimate.samples} samples of {torque_kind} torque",
         f"condition number of the regressor: {estimate.fit.condition_number:.1f}",
         "",
         _feasibility(estimate),
