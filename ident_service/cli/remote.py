@@ -116,7 +116,7 @@ def remote_job(
     ended: Ended | None = None,
     **fields: Reader,
 ) -> RemoteVerb:
-    """Return a remote verb that runs a job of `kind`, or of its name; its fields are named arguments and `fields`.
+    """Return a remote verb that runs a job of `kind` (its own name if None); fields are named arguments and `fields`.
 
     Args:
         argument_names: arguments that are fields of the job under their own names.
@@ -171,7 +171,7 @@ def telling_of_arm(arm: str, job: str) -> Iterator[None]:
 
 
 def job_verb(make: Callable[[IdentClient, argparse.Namespace], dict[str, Any]], ended: Ended | None = None) -> Verb:
-    """Return a verb's function: it queues the job that `make` makes (confirmed first if it moves), waits, and answers.
+    """Return a verb's function: it queues the job that `make` returns (if it moves, confirmed first), waits, answers.
 
     Args:
         make: the job of the words; its kind is the verb if it does not say another.

@@ -73,7 +73,7 @@ def how_fitted(estimate: Estimate) -> tuple[str, ...]:
 
 
 def noise_and_model(noise_deviations: Array | None, variances: Array) -> str:
-    """Describe how much of the parameters' variances is noise (of these deviations), and how much error of the model.
+    """Describe how much of the parameters' variances is noise, given its deviations, and how much error of the model.
 
     Args:
         noise_deviations: standard deviations by what differs between repetitions of the motion, shape (base,); None

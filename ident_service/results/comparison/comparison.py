@@ -129,7 +129,7 @@ class ComparedSet:
 
     @property
     def unconstrained(self) -> Array | None:
-        """Return the values before a feasible set changed them, or in use if none did, (base,); None if not known."""
+        """Return the values before a feasible set changed them (those in use if none did), (base,); None: unknown."""
         values = self.content["base_parameters"].get("unconstrained_values")
         if values is None and self.content.get("feasible_set") == "none":
             return self.file.values
@@ -293,7 +293,7 @@ class Pair:
 
     @property
     def verdict(self) -> Verdict:
-        """Return `changed`, `unchanged` or `impossible`: untested, or unchanged but for friction that was left out."""
+        """Return `changed`, `unchanged` or `impossible`: nothing tested, or no change but some friction not tested."""
         if self.drift is None or (self.drift.verdict == "unchanged" and self.other_shape):
             return "impossible"
         return self.drift.verdict
