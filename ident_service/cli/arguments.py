@@ -236,7 +236,7 @@ class VerbList:
         examples: Sequence[str] = (),
         former: str | None = None,
         hidden: bool = False,
-        word: str | None = None,
+        stands_for: str | None = None,
     ) -> Parser:
         """Add a verb with its help and the function that runs it; return its parser, to add arguments to.
 
@@ -249,9 +249,9 @@ class VerbList:
             examples: arguments after the verb; one string each, as typed.
             former: the verb's earlier name, which is still understood and not listed.
             hidden: leave the verb out of the list of verbs.
-            word: the verb that a hidden one stands for.
+            stands_for: the verb that a hidden one stands for; itself when None.
         """
-        word = word or f"{self.prefix}{name}"
+        word = stands_for or f"{self.prefix}{name}"
         if not hidden:
             self.parser.shown[name] = text
         parser = self.commands.add_parser(name) if hidden else self.commands.add_parser(name, help=text)

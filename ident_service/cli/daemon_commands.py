@@ -52,7 +52,7 @@ def add(verbs: VerbList) -> None:
     sub.add_argument("name", metavar="NAME", help="shown in the audit log")
     sub.add_argument("--role", choices=["viewer", "operator"], required=True)
     add_by(sub)
-    tokens.add("list", _list, "list names and roles", hidden=True, word="tokens")
+    tokens.add("list", _list, "list names and roles", hidden=True, stands_for="tokens")
     sub = tokens.add(
         "revoke", _revoke, "revoke a token and its sessions", examples=("ann", "ann --server http://127.0.0.1:8470")
     )

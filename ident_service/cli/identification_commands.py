@@ -479,7 +479,7 @@ def _add_comparing(verbs: VerbList) -> None:
 
 
 def accepted_name(path: Path) -> str | None:
-    """Return NAME of a path `accepted:NAME`, which means an arm's accepted set; None of a file and of other paths."""
+    """Return NAME of a path `accepted:NAME`, which means an arm's accepted set; None for a file and other paths."""
     word, _, name = str(path).partition(":")
     return name if word == "accepted" and name and "/" not in name and not path.exists() else None
 

@@ -43,7 +43,7 @@ def add(verbs: VerbList) -> None:
     when.add_argument("--maintenance", action="store_true", help="after each maintenance event")
     sub.add_argument("--motion", metavar="ID", help="of a motion of the registry; default: the description's")
     add_by(sub)
-    sub = group.add("list", _list, "list schedules and when they are due", hidden=True, word="schedules")
+    sub = group.add("list", _list, "list schedules and when they are due", hidden=True, stands_for="schedules")
     sub.add_argument("arm", nargs="?", metavar="NAME", help="of the arm; default: all")
     for name, verb, text in (
         ("remove", _remove, "remove a schedule"),
@@ -66,7 +66,7 @@ def add(verbs: VerbList) -> None:
     add_by(sub)
     group = verbs.group("due", "list due re-identifications; dismiss one", _due, examples=("", "--arm wam7"))
     _of_arm(group.parser)
-    sub = group.add("list", _due, "list due re-identifications", hidden=True, word="due")
+    sub = group.add("list", _due, "list due re-identifications", hidden=True, stands_for="due")
     sub.add_argument("arm", nargs="?", metavar="NAME", help="of the arm; default: all")
     noted = ("1 --note 'new gear box next week'", "1 --note 'arm is out of use' --by Ann")
     _add_number_and_note(group.add("dismiss", _dismiss, "dismiss a due re-identification", examples=noted))
@@ -79,7 +79,7 @@ def add(verbs: VerbList) -> None:
         examples=("", "--arm wam7"),
     )
     _of_arm(group.parser)
-    sub = group.add("list", _alarms, "list open alarms", hidden=True, word="alarms")
+    sub = group.add("list", _alarms, "list open alarms", hidden=True, stands_for="alarms")
     sub.add_argument("arm", nargs="?", metavar="NAME", help="of the arm; default: all")
     sub = group.add(
         "acknowledge",

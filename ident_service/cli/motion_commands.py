@@ -96,12 +96,12 @@ class HeldKey:
         self._look()
         return self._released
 
-    def wait(self, stop_requested: Callable[[], bool], seconds: float = 0.02) -> bool:
+    def wait(self, stop_requested: Callable[[], bool], poll_seconds: float = 0.02) -> bool:
         """Wait until the key is held; return False once it is released, the terminal is gone or a stop is requested."""
         while not self.held():
             if self._released or stop_requested():
                 return False
-            select.select([self._fd], [], [], seconds)
+            select.select([self._fd], [], [], poll_seconds)
         return True
 
     def _look(self) -> None:

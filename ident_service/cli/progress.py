@@ -51,7 +51,7 @@ class Mark:
 
 
 def estimate(begun: float, first: Mark, mark: Mark, now: float) -> tuple[float | None, float | None]:
-    """Return (share done, time left [s]) by the last mark's own time left, else by the pace between marks; or None.
+    """Return (share done, time left [s]) by the last mark's own time left, else the pace since `first`; None: unknown.
 
     Args:
         begun: time when the command began [s].

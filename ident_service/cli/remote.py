@@ -64,7 +64,7 @@ def add(verbs: VerbList) -> None:
         examples=("", "--most 50", "--server http://127.0.0.1:8470"),
     )
     jobs.parser.add_argument("--most", type=count, default=20, metavar="N", help="of the newest (default: 20)")
-    sub = jobs.add("list", listed, "list jobs, the newest first", hidden=True, word="jobs")
+    sub = jobs.add("list", listed, "list jobs, the newest first", hidden=True, stands_for="jobs")
     sub.add_argument("--most", type=count, default=20, metavar="N")
     for name, verb, text, more in (
         ("show", _show, "show one job and its result", ""),
@@ -116,7 +116,7 @@ def remote_job(
     ended: Ended | None = None,
     **fields: Reader,
 ) -> RemoteVerb:
-    """Return a remote verb that runs a job; its fields are the arguments of these names and what `fields` read.
+    """Return a remote verb that runs a job of `kind` (its own name if None); fields are named arguments and `fields`.
 
     Args:
         argument_names: arguments that are fields of the job under their own names.
@@ -171,7 +171,7 @@ def telling_of_arm(arm: str, job: str) -> Iterator[None]:
 
 
 def job_verb(make: Callable[[IdentClient, argparse.Namespace], dict[str, Any]], ended: Ended | None = None) -> Verb:
-    """Return a verb's function: it queues a job (if the arm moves, confirmed first), waits for its end, and answers.
+    """Return a verb's function: it queues the job that `make` returns (if it moves, confirmed first), waits, answers.
 
     Args:
         make: the job of the words; its kind is the verb if it does not say another.

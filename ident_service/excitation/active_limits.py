@@ -97,7 +97,7 @@ def active_limits(task: Task, coefficients: Array, samples_per_period: int) -> t
 
 
 def forces_of(slopes: Array, pull: Array) -> Array:
-    """Return the forces of limits, 0 to 50, that balance the criterion's gradient best, shape (limits,).
+    """Return the forces of limits, 0 to 50, (limits,), with which the columns of `slopes` sum best to `pull`.
 
     Neighbouring samples have nearly the same slope, with which scipy's `nnls` may give up after any number of rounds.
 

@@ -20,7 +20,7 @@ _HELD = 0.7  # of the torque limits, that a motion about home takes at most
 def excitation(
     model: ArmModel, purpose: Literal["identification", "validation"], *, checked: bool = True
 ) -> Excitation:
-    """Return the motion configured for a purpose; if `checked`, raise MotionRefused where it may leave limits.
+    """Return the motion configured for a purpose; MotionRefused for limits missing or, if `checked`, that it may leave.
 
     Raises:
         MotionRefused: limits are missing, or the motion leaves them.

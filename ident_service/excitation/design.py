@@ -197,7 +197,7 @@ class Prover:
         best: Attempt | None = None,
         task: Task | None = None,
     ) -> Attempt | None:
-        """Prove candidates, best first, searching on or shrinking if that fails; return the best, even if unproven.
+        """Prove candidates, best first, searching on or shrinking if it fails; return the best, if any, even unproven.
 
         Args:
             candidates: candidates of the search. Their values are of a smoothed criterion; the exact one, used here,
@@ -346,7 +346,7 @@ def complete_task(
     design: Design,
     basis: Basis,
     base: BaseParameters,
-    noise: Array | None = None,
+    torque_deviations: Array | None = None,
     earlier_information: Array | None = None,
 ) -> Task:
     """Build the search task of a design, with limits less margins; raises where limits or parameters do not fit.
@@ -356,9 +356,9 @@ def complete_task(
         design: criterion and margins.
         basis: family of motions.
         base: the parameters that the motion shall teach.
-        noise: standard deviation of each joint's torque, shape (joints,); the description's when None.
+        torque_deviations: standard deviation of each joint's torque, shape (joints,); the description's when None.
         earlier_information: information from earlier recordings, plain rows for the condition number and else whitened
-            by `noise`.
+            by `torque_deviations`.
 
     Raises:
         MotionRefused: limits are missing or contradict each other.
@@ -375,7 +375,7 @@ def complete_task(
         )
     chosen = np.array([places[name.replace(" ", "")] for name in design.parameters], dtype=np.intp)
     plain = design.criterion == "condition_number"
-    own_noise = described_noise(model, full).deviation if noise is None else noise
+    own_noise = described_noise(model, full).deviation if torque_deviations is None else torque_deviations
     return Task(
         model=control_model(model),
         columns=base.base,
@@ -437,7 +437,7 @@ def design_motion(
     budget: Budget | None = None,
     basis: Basis | None = None,
     base: BaseParameters | None = None,
-    noise: Array | None = None,
+    torque_deviations: Array | None = None,
     earlier_information: Array | None = None,
     earlier_search: SearchResult | None = None,
     veto: Callable[[FourierPath | PosturePath], str | None] = lambda _: None,
@@ -454,7 +454,7 @@ def design_motion(
         budget: budget of the search; a minute on two cores when None.
         basis: another family of motions.
         base: the parameters that the motion shall teach; all that the family can when None.
-        noise: standard deviation of each joint's torque, shape (joints,); from the description when None.
+        torque_deviations: standard deviation of each joint's torque, shape (joints,); from the description when None.
         earlier_information: information from earlier recordings (`settled`).
         earlier_search: earlier search for the same task, to go on from.
         veto: function that returns a further objection to a motion of which everything is proven, in words, or None; a
@@ -470,7 +470,7 @@ def design_motion(
     asked = motion_family(design, model)
     require_storable(asked[0] if basis is None else basis)
     basis, base = asked[0] if basis is None else basis, asked[1] if base is None else base
-    task = complete_task(model, design, basis, base, noise, earlier_information)
+    task = complete_task(model, design, basis, base, torque_deviations, earlier_information)
     collision = CollisionModel(model)
     _require_free_home(model, task.limits, collision)
     safe = safe_posture(model, task.limits, seed)

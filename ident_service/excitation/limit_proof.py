@@ -234,7 +234,7 @@ def _drive_rates(velocity: list[TaylorModel], coupling: Array) -> list[TaylorMod
 
 
 def power_bounds(torque: list[TaylorModel], velocity: list[TaylorModel], supply: Supply, coupling: Array) -> Array:
-    """Return an upper bound of the power drawn from the supply [W] in each time interval, shape (stretches,).
+    """Return an upper bound of the power drawn from the supply [W] in each time interval, shape (intervals,).
 
     Torque and velocity of the joints are handed to the drives that move them, `tau_drive = C^-T tau`.
     """
@@ -332,7 +332,7 @@ def certified_along(
     duration: float,
     required_clearance: float,
 ) -> Clearance:
-    """Return a proven lower bound of the distance of all pairs for any motion no faster than `highest_speed`.
+    """Return a proven lower bound of the distance of all pairs along a motion never faster than `highest_speed`.
 
     Args:
         collision: the pairs.

@@ -176,9 +176,9 @@ class Multipliers:
     values: Limits
     weight: float
 
-    def tightened(self, limit_values: Limits, weight_factor: float) -> Multipliers:
-        """Return multipliers and weight (times `weight_factor`) after a minimisation that ended at `limit_values`."""
-        values = {name: np.maximum(0.0, self.values[name] + self.weight * c) for name, c in limit_values.items()}
+    def tightened(self, excesses: Limits, weight_factor: float) -> Multipliers:
+        """Return multipliers and weight (times `weight_factor`) after a minimisation that left these `excesses`."""
+        values = {name: np.maximum(0.0, self.values[name] + self.weight * c) for name, c in excesses.items()}
         return Multipliers(values, self.weight * weight_factor)
 
 

@@ -178,7 +178,7 @@ def design_files(
         design,
         seed=request.seed,
         budget=request.budget,
-        noise=noise.deviation,
+        torque_deviations=noise.deviation,
         earlier_information=added,
         earlier_search=earlier,
         veto=lambda path: motion_stop_contact(path, limits, model),

@@ -113,7 +113,7 @@ class MotionTraces:
         return np.where(sign * limit >= LARGEST, np.inf, sign * limit)
 
     def shares(self, quantity: str) -> Array:
-        """Return each joint's largest distance from mid-range over half the range, (joints,), so that 1 is at a limit.
+        """Return each joint's largest distance from mid-range over half the range: 1 at a limit, NaN without limits.
 
         NaN where a joint has no limits on both sides, or the quantity is not given.
         """

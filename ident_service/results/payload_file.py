@@ -113,7 +113,7 @@ def _certificate(payload: Payload) -> dict[str, Any] | None:
 
 
 def write_payload(path: Path, document: Any) -> None:
-    """Write `payload.json`.
+    """Write the content of `payload.json` to the file `path`, after validating it against the schema.
 
     Raises:
         ParameterError: the document does not fit the schema.

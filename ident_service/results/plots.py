@@ -159,7 +159,7 @@ def printable(text: str) -> str:
 
 
 def format_number(value: float, digits: int = 3) -> str:
-    """Format a number for people, with a real minus sign."""
+    """Format a number for people with so many significant `digits` and a real minus sign."""
     text = f"{value:.{digits}g}"
     if "e+" in text and abs(value) < 1e6:
         text = f"{value:.0f}"
@@ -167,7 +167,7 @@ def format_number(value: float, digits: int = 3) -> str:
 
 
 def shortened(text: str, width: int) -> str:
-    """Return text in so many characters at most, its end left out where it is longer."""
+    """Return text in `width` characters at most, its end replaced by `...` where it is longer."""
     return text if len(text) <= width else text[: width - 3] + "..."
 
 
@@ -406,7 +406,7 @@ def draw_frame(
 
 
 def draw_legend(canvas: Canvas, right: float, y: float, entries: Sequence[tuple[str, str, str]]) -> None:
-    """Draw a legend of colours and strokes, in one row that ends at `right` [px].
+    """Draw a legend, each entry (form, kind of the drawn thing, words), in one row that ends at `right` [px].
 
     Args:
         canvas: to draw on.

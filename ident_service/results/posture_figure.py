@@ -124,7 +124,7 @@ def draw_obstacle(canvas: Canvas, axes: Axes, view: tuple[int, int], obstacle: S
 
 
 def write_name(canvas: Canvas, axes: Axes, words: str, x: float, y: float) -> None:
-    """Write a name in the middle of the object it names, moved so that it stays inside the view."""
+    """Write `words` with their middle at (x, y) [px], or as near to it as keeps them inside the view of the axes."""
     half = 3.2 * len(words) + 4
     x = min(max(x, axes.left + half), axes.left + axes.width - half)
     y = min(max(y + 3.5, axes.top + 14), axes.top + axes.height - 6)

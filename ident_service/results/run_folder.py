@@ -75,7 +75,7 @@ def write_results(
     more_entries: dict[str, Any] | None = None,
     unusable: Sequence[str] = (),
     described: ArmConfig | None = None,
-    torque: str = "commanded",
+    torque_kind: str = "commanded",
 ) -> list[str]:
     """Write an estimate's files and its certificate's verifier into a folder, no manifest; return their names.
 
@@ -85,14 +85,16 @@ def write_results(
         more_entries: further entries of `parameters.json`.
         unusable: reasons why the estimate must not be used.
         described: the arm's description as it was read, where options or recordings changed it.
-        torque: kind of torque in the recordings: `measured` by the drives, `commanded`, or `recorded` by another
+        torque_kind: kind of torque in the recordings: `measured` by the drives, `commanded`, or `recorded` by another
             program.
 
     Returns:
         The names of the files. An estimate that no body has comes without a URDF, because URDF cannot express it.
     """
     document = (
-        parameters_document(estimate, described) | {"unusable": list(unusable), "torque": torque} | (more_entries or {})
+        parameters_document(estimate, described)
+        | {"unusable": list(unusable), "torque": torque_kind}
+        | (more_entries or {})
     )
     write_parameters(folder / PARAMETERS, document)
     write_atomically(folder / ARM, estimate.model.config.model_dump_json(indent=1) + "\n")
@@ -100,7 +102,7 @@ def write_results(
     if estimate.delta is not None:
         write_urdf(folder / URDF, estimate.model, estimate.delta)
         names.append(URDF)
-    text = summary(estimate, unusable, torque, document.get("warnings", ()))
+    text = summary(estimate, unusable, torque_kind, document.get("warnings", ()))
     write_atomically(folder / REPORT, text + "\n" + parameter_table(estimate))
     write_verifier(folder)
     return [*names, REPORT, VERIFIER]

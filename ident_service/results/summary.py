@@ -72,18 +72,18 @@ def how_fitted(estimate: Estimate) -> tuple[str, ...]:
     )
 
 
-def noise_and_model(noise: Array | None, variances: Array) -> str:
-    """Describe how much of the variances is noise and how much error of the model, as far as repetitions tell.
+def noise_and_model(noise_deviations: Array | None, variances: Array) -> str:
+    """Describe how much of the parameters' variances is noise, given its deviations, and how much error of the model.
 
     Args:
-        noise: standard deviations by what differs between repetitions of the motion, shape (base,); None where most of
-            the motion is not repeated.
+        noise_deviations: standard deviations by what differs between repetitions of the motion, shape (base,); None
+            where most of the motion is not repeated.
         variances: variances of the parameters, shape (base,); infinite or NaN where unknown.
     """
-    if noise is None:
+    if noise_deviations is None:
         return "Most of the motion is not repeated, so noise and model error cannot be separated."
-    known = np.isfinite(noise) & np.isfinite(variances) & (variances > 0.0)
-    share = np.clip(noise[known] ** 2 / variances[known], 0.0, 1.0)
+    known = np.isfinite(noise_deviations) & np.isfinite(variances) & (variances > 0.0)
+    share = np.clip(noise_deviations[known] ** 2 / variances[known], 0.0, 1.0)
     return (
         f"The motion is repeated: {np.median(share):.0%} of a parameter's variance is noise (median; "
         f"{share.min():.0%} to {share.max():.0%}), the rest is model error, which more periods do not reduce."
@@ -112,7 +112,7 @@ WHAT_THEN = (
 
 
 def implausible_links(estimate: Estimate) -> tuple[str, ...]:
-    """Return a sentence for each link whose chosen values are implausible: the value and its bound.
+    """Return a sentence per link with implausible values and bounds; none if a prior or custom knowledge chose them.
 
     Args:
         estimate: estimate with link values; one without, or with values that a prior or custom knowledge asked for, has
@@ -146,14 +146,14 @@ def implausible_links(estimate: Estimate) -> tuple[str, ...]:
 
 
 def summary(
-    estimate: Estimate, unusable: Sequence[str] = (), torque: str = "commanded", warnings: Sequence[str] = ()
+    estimate: Estimate, unusable: Sequence[str] = (), torque_kind: str = "commanded", warnings: Sequence[str] = ()
 ) -> str:
     """Describe an estimate in lines no wider than a terminal: verdict, reasons, a row per joint, then details.
 
     Args:
         estimate: estimate to describe.
         unusable: reasons why it must not be used, which come first.
-        torque: kind of torque in the recordings: `measured`, `commanded`, or `recorded` by another program.
+        torque_kind: kind of torque in the recordings: `measured`, `commanded`, or `recorded` by another program.
         warnings: what is wrong with the recordings, in words.
     """
     own = estimate.candidates[estimate.chosen]
@@ -163,7 +163,7 @@ def summary(
         "",
         "Details",
         f"{estimate.model.config.name}: {estimate.base.size} base parameters of {len(estimate.base.names)} link "
-        f"parameters, from {estimate.samples} samples of {torque} torque",
+        f"parameters, from {estimate.samples} samples of {torque_kind} torque",
         f"condition number of the regressor: {estimate.fit.condition_number:.1f}",
         "",
         _feasibility(estimate),

@@ -148,7 +148,7 @@ def test_a_terminal_that_is_gone_is_a_release(held: Keyboard) -> None:
 def test_nobody_who_holds_it_is_not_waited_for_when_asked_to_stop(keyboard: Keyboard) -> None:
     asked: list[int] = []
     with keyboard.key as key:
-        assert not key.wait(lambda: asked.append(1) or len(asked) > 3, seconds=0.001)
+        assert not key.wait(lambda: asked.append(1) or len(asked) > 3, poll_seconds=0.001)
 
 
 @pytest.mark.parametrize("error", [None, KeyboardInterrupt, RuntimeError])

@@ -129,7 +129,7 @@ class ComparedSet:
 
     @property
     def unconstrained(self) -> Array | None:
-        """Return the values before they were held in a feasible set, shape (base,); None where the file has none."""
+        """Return the values before a feasible set changed them (those in use if none did), (base,); None: unknown."""
         values = self.content["base_parameters"].get("unconstrained_values")
         if values is None and self.content.get("feasible_set") == "none":
             return self.file.values
@@ -151,7 +151,7 @@ class ComparedSet:
             raise ParameterError(f"{self.path}: {error}") from None
 
     def identified(self, base_indices: NDArray[np.intp], *, use_unconstrained: bool) -> ComparedEstimate | None:
-        """Return values, covariance and motion of some base parameters for the tests; None without a covariance.
+        """Return values (unconstrained if asked and known), covariance, motion of some parameters; None: no covariance.
 
         Args:
             base_indices: indices of the parameters, in the order of the comparison.
@@ -293,7 +293,7 @@ class Pair:
 
     @property
     def verdict(self) -> Verdict:
-        """Return `changed`, `unchanged` or `impossible`: untested, or unchanged but for friction that was left out."""
+        """Return `changed`, `unchanged` or `impossible`: nothing tested, or no change but some friction not tested."""
         if self.drift is None or (self.drift.verdict == "unchanged" and self.other_shape):
             return "impossible"
         return self.drift.verdict

@@ -358,7 +358,7 @@ def comparison_document(comparison: Comparison) -> dict[str, Any]:
 
 
 def write_comparison(path: Path, comparison: Comparison) -> None:
-    """Write `comparison.json`.
+    """Write a comparison as JSON to the file `path`, `comparison.json` as a rule, after validating it by its schema.
 
     Raises:
         ParameterError: the document does not fit the schema.

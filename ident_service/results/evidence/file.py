@@ -99,7 +99,7 @@ _LARGEST_LOG = 60.0  # largest decimal logarithm
 
 
 def write_evidence(path: Path, evidence: Evidence) -> None:
-    """Write evidence after validating it against the schema.
+    """Write evidence to the file `path`, after validating it against the schema.
 
     Raises:
         ParameterError: it does not fit the schema.

@@ -41,7 +41,7 @@ def is_real(parameters: Array) -> bool:
 
 
 def joint_bodies(model: ArmModel, delta: Array) -> Array:
-    """Return each link's ten parameters in its joint's frame, shape (joints, 10).
+    """Return each link's ten parameters in its joint's frame, (joints, 10); ModelError unless all masses are positive.
 
     Raises:
         ModelError: a link without positive mass.

@@ -40,7 +40,7 @@ _LEAST_MASS = 1e-3  # [kg]
 
 
 def csv_export(arm: IdentifiedArm, file_name: str) -> str:
-    """Return all parameters as a CSV table, in which all digits of the numbers are kept.
+    """Return all parameters as the text of a CSV table, with all digits; errors name the file as `file_name`.
 
     Args:
         arm: arm, with link parameters or without.
@@ -296,7 +296,7 @@ def known_formats(format_list: str) -> tuple[str, ...]:
 
 
 def export_texts(arm: IdentifiedArm, formats: Sequence[str]) -> tuple[Export, ...]:
-    """Return the files of an export, each read back and found to say what the parameters say.
+    """Return the files of an export as texts, unwritten, each read back and found to say what the parameters say.
 
     Raises:
         UsageError: no such format.
@@ -313,7 +313,7 @@ def export_run(
     *,
     anyway: bool = False,
 ) -> tuple[Export, ...]:
-    """Write a folder of results in some formats into a folder, all files or none; return what was written.
+    """Export results into `folder`, all files or none, forbidden values only if `anyway`; return what was written.
 
     Args:
         results_folder: the folder, every file in it as its manifest says.

@@ -43,7 +43,7 @@ def gravity_of(model: ArmModel) -> tuple[float, float, float]:
 
 
 def disagreement(computed: Array, expected: Array) -> float:
-    """Return the largest |found - meant| over the largest |meant|; infinite where something found is not finite."""
+    """Return the largest |computed - expected| over the largest |expected|; infinite unless all computed are finite."""
     if not np.all(np.isfinite(computed)):
         return np.inf
     return float(np.abs(computed - expected).max() / max(np.abs(expected).max(), np.finfo(float).tiny))
@@ -164,7 +164,7 @@ class RecordedMotion:
 def unsupported_terms(
     model: ArmModel, delta: Array, carried: Carried, motion: RecordedMotion | None = None
 ) -> tuple[str, ...]:
-    """Return the joint terms with a value that a file does not carry, in words, with their torque where it is known.
+    """Return, in words, pre-sliding and the joint terms with a value that a file does not carry, with torque if known.
 
     Args:
         model: the arm.

@@ -42,13 +42,13 @@ _ENTITIES = {"&quot;": '"', "&apos;": "'"}
 def read_sdf(
     text: str, file_name: str, gravity: tuple[float, float, float], joint_names: Mapping[str, str] | None = None
 ) -> WrittenArm:
-    """Read an SDF model of revolute, continuous and prismatic joints that stands on `world`; raise for any other.
+    """Read an SDF arm of turning or sliding joints on `world`, joints renamed by `joint_names`; ModelError for others.
 
     Args:
         text: the file.
         file_name: name of the file, for errors.
         gravity: gravity of the world that the model is put in [m/s^2].
-        joint_names: other names for its joints.
+        joint_names: names in the file to those of the arm that is returned; a joint that is not in it keeps its own.
 
     Raises:
         ModelError: not such a model.

@@ -434,7 +434,7 @@ def _commented(text: str, said: tuple[str, ...]) -> str:
 
 
 def write_urdf(path: Path, model: ArmModel, delta: Array) -> None:
-    """Write the identified URDF, after pinocchio has read it back with the same torques.
+    """Write the URDF of an arm with link parameters `delta`, after pinocchio has read it back with the same torques.
 
     Args:
         path: the file.

@@ -393,7 +393,7 @@ def _timing_figure(place: int, timing: Timing, deviation: float | None) -> Figur
 
 
 def timing_words(timing: Timing, step_deviation: float | None = None) -> str:
-    """Summarise a recording's timing in words.
+    """Summarise a recording's timing in words, with the standard deviation of its steps [s] where that is given.
 
     Args:
         timing: of the recording.
@@ -613,14 +613,14 @@ def body_figures(evidence: Evidence) -> list[Figure]:
     return [_bodies_figure(evidence.joints, evidence.posed, name, view, where) for name, view in _VIEWS]
 
 
-def ellipse(axes: Array, view: tuple[int, int]) -> Array:
-    """Return the outline of an ellipsoid seen along a base axis, about its centre [m], shape (corners, 2).
+def ellipse(half_axes: Array, view: tuple[int, int]) -> Array:
+    """Return the outline of an ellipsoid of these half axes, seen along a base axis, from its centre [m], (corners, 2).
 
     Args:
-        axes: half axes as rows [m], shape (3, 3).
+        half_axes: half axes as rows [m], shape (3, 3).
         view: the two axes of the base frame that are seen.
     """
-    shadow = axes[:, list(view)]
+    shadow = half_axes[:, list(view)]
     values, vectors = np.linalg.eigh(shadow.T @ shadow)
     angle = np.linspace(0.0, 2.0 * np.pi, _OUTLINE, endpoint=False)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])

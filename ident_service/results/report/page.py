@@ -130,7 +130,7 @@ def verdict_rule() -> str:
 
 
 def error_table(evidence: Evidence) -> Table:
-    """Return a table of all estimates: feasible or not, and torque error on every recording."""
+    """Return a table of all estimates: feasible or not, torque errors as fitted and on each recording not fitted to."""
     unseen = [one.name for one in evidence.recordings if one.role == "validation"]
     rows = []
     for place, one in enumerate(evidence.estimates):
@@ -152,7 +152,7 @@ def error_table(evidence: Evidence) -> Table:
 
 
 def joint_table(joints: Sequence[JointAssessment], parameters: ParameterFile) -> Table | None:
-    """Return the torque error per joint on every recording; None with fewer than two recordings not fitted to."""
+    """Return each joint's torque error, fitted and on each recording not fitted to; None if they are fewer than two."""
     unseen = parameters.content.get("validation", [])
     if len(unseen) < 2:
         return None

@@ -77,12 +77,12 @@ def inline(svg: str) -> Markup:
 
 
 def render(template: str, scripts: Sequence[str] = (), styles: Sequence[str] = (), **values: Any) -> str:
-    """Return a whole HTML document that loads nothing, its scripts allowed by their hashes alone.
+    """Return an HTML page, from a template file, that holds these texts of scripts and style sheets and loads nothing.
 
     Args:
         template: name of the file in `templates`.
-        scripts: scripts of the page, in order; text of this package alone.
-        styles: further style sheets.
+        scripts: texts of the page's scripts, in order, of this package alone; their hashes alone are allowed.
+        styles: texts of further style sheets.
         values: of the template; every one that it names must be there.
     """
     hashes = " ".join(f"'sha256-{_digest(script)}'" for script in scripts)
@@ -102,16 +102,16 @@ def render(template: str, scripts: Sequence[str] = (), styles: Sequence[str] = (
 
 @cache
 def asset(file_name: str) -> str:
-    """Return the text of a file of this package."""
+    """Return the text of a file beside this module, a script or a style sheet of the report."""
     return files(str(__package__)).joinpath(file_name).read_text(encoding="utf-8")
 
 
 @cache
-def vendored(name: str) -> str:
-    """Return a file of uPlot, its licence before it; there is one copy, which the daemon's pages show, too."""
+def vendored(file_name: str) -> str:
+    """Return the text of a file of uPlot, its licence before it; the daemon's pages have the same copy."""
     place = files("ident_service").joinpath("vendored")
     licence = place.joinpath("uPlot.LICENSE.txt").read_text(encoding="utf-8").strip()
-    return f"/* uPlot\n{licence} */\n{place.joinpath(name).read_text(encoding='utf-8')}"
+    return f"/* uPlot\n{licence} */\n{place.joinpath(file_name).read_text(encoding='utf-8')}"
 
 
 def _digest(script: str) -> str:
