@@ -76,6 +76,7 @@ def bootstrap(
     seed: int = 0,
     solve: Solve | None = None,
     *,
+    prior: Prior | None = None,
     blocks_per_run: int | None = None,
     level: float = 0.95,
     progress: Progress = lambda _done, _all: None,
@@ -91,6 +92,7 @@ def bootstrap(
         seed: of the draws; the same seed gives the same replicates.
         solve: function from a replicate's least squares to base parameters of shape (base,); the constrained least
             squares (eq. 74) over `conditions` when None.
+        prior: prior that replicates are drawn to without `solve`; None for none.
         blocks_per_run: consecutive blocks drawn together; `run_length` says how many when None.
         level: share of the replicates inside the intervals, between 0 and 1.
         progress: called after each replicate with how many are done, and how many there will be.
@@ -117,7 +119,7 @@ def bootstrap(
         least = _least_squares(factors, rows, times, fit)
         blind |= ~np.isfinite(least.standard_deviations)
         try:
-            beta = constrained_least_squares(least, base, conditions).beta if solve is None else solve(least)
+            beta = constrained_least_squares(least, base, conditions, prior).beta if solve is None else solve(least)
         except SolverError as error:
             raise SolverError(f"replicate {number + 1} of {replicates}, {error.problem}", error.status) from error
         if beta.shape != (base.size,):

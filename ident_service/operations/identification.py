@@ -319,15 +319,15 @@ def _known_loads(loads: Mapping[Path, Payload]) -> dict[str, Any]:
 
 
 def _bootstrap(estimate: Estimate, replicates: int) -> dict[str, Any]:
-    base, conditions, known = estimate.base, estimate.conditions, estimate.custom
+    base, conditions, prior, known = estimate.base, estimate.conditions, estimate.prior, estimate.custom
     solve = None
     if known is not None:
 
         def solve(fit: LeastSquares) -> Array:
-            found = convex_least_squares(fit, base, conditions, custom=known.function, solver=known.solver)
+            found = convex_least_squares(fit, base, conditions, prior=prior, custom=known.function, solver=known.solver)
             return found.estimate.beta
 
-    drawn = bootstrap(estimate.fitted, estimate.fit, base, conditions, replicates, solve=solve)
+    drawn = bootstrap(estimate.fitted, estimate.fit, base, conditions, replicates, solve=solve, prior=prior)
     return {
         "replicates": replicates,
         "blocks_in_a_run": drawn.run,

@@ -180,6 +180,19 @@ def test_a_custom_penalty_counts_as_a_prior_does(setting: Setting, kind: Any) ->
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("code", [None, "def known(link, base):\n    return []\n"])
+def test_replicates_are_drawn_to_the_prior(setting: Setting, tmp_path: Path, code: str | None) -> None:
+    arm = "planar2" if code is None else str(written(tmp_path, "pulled", code))
+    spread = []
+    for weight in (1e-6, 1e6):
+        request = Request(arm=arm, recordings=(setting.path,), replicates=3, prior="euclidean", prior_weight=weight)
+        identify_files(request, tmp_path / f"{weight:g}")
+        drawn = json.loads((tmp_path / f"{weight:g}" / "parameters.json").read_text())["bootstrap"]
+        spread.append(max(drawn["standard_deviations"]))
+    assert spread[1] < 0.5 * spread[0]  # equal where the prior is not known to them
+
+
+@pytest.mark.slow
 def test_knowledge_about_base_parameters_and_every_replicate(setting: Setting, tmp_path: Path) -> None:
     expression = setting.plain.base.expressions[-3]
     assert expression == "fv2"

@@ -20,7 +20,7 @@ from ident_service.config.recording import RecordingFormat
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.results.assessment import assess
 from ident_service.results.plots import Axes, Canvas, draw_frame, range_around
-from ident_service.results.report.figures import figures, friction_scatter
+from ident_service.results.report.figures import figures, friction_scatter, timing_figures, timing_words
 from ident_service.results.report.page import report_html
 
 ORDER = ["verdict", "torque", "parameters", "residual", "friction", "doubt", "bodies", "timing", "files"]
@@ -434,3 +434,13 @@ def test_the_friction_s_shape_is_in_its_section(good: Made) -> None:
 def test_the_page_is_small(good: Made) -> None:
     # Two short recordings of two joints; the WAM's size is held by the slow tests.
     assert len(good.page.encode()) < 1e6
+
+
+def test_recordings_of_one_name_have_their_own_timing(good: Made) -> None:
+    first = replace(good.evidence.timing[0], recording="motion.csv")
+    evidence = replace(good.evidence, timing=(first, first))
+    quality = [{"recording": "motion.csv", "jitter_seconds": {"standard_deviation": one}} for one in (1e-6, 9e-5)]
+    parameters = replace(good.parameters, content={**good.parameters.content, "recording_quality": quality})
+    one, other = (figure.description for figure in timing_figures(evidence, parameters))
+    assert (one, other) == (timing_words(first, 1e-6), timing_words(first, 9e-5))
+    assert one != other

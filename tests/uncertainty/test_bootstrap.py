@@ -14,6 +14,7 @@ from ident_service.errors import ModelError, SolverError
 from ident_service.estimation.bootstrap import block_resample_counts, bootstrap, run_length
 from ident_service.estimation.equations import Equations
 from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet, feasible_set
+from ident_service.estimation.feasible.priors import Prior
 from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares
 from ident_service.model.base_parameters import BaseParameters, base_parameters
@@ -136,6 +137,17 @@ def test_a_replicate_is_the_estimate_from_the_blocks_it_drew() -> None:
         wanted = constrained_least_squares(least, base, conditions).beta
         np.testing.assert_allclose(least.R1 @ beta, least.R1 @ wanted, rtol=0, atol=1e-6 * np.linalg.norm(least.rho1))
         assert conditions.margin(constrained_least_squares(least, base, conditions).delta)[0] > 0.0
+
+
+def test_replicates_are_drawn_to_the_prior_of_the_estimate() -> None:
+    gathered, base, conditions = arm_equations()
+    fit = ordinary_least_squares(gathered.total)
+    known = constrained_least_squares(fit, base, conditions).delta
+    prior = Prior("euclidean", base.names, known, 1e6)
+    made = bootstrap(gathered, fit, base, conditions, 5, prior=prior)
+    loose = bootstrap(gathered, fit, base, conditions, 5)
+    np.testing.assert_allclose(made.betas, np.tile(base.K @ known, (5, 1)), rtol=0, atol=1e-3)
+    assert made.standard_deviations.max() < 0.01 * loose.standard_deviations.max()
 
 
 def test_the_interior_point_method_and_active_sets_scatter_alike() -> None:

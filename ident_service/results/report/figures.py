@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -345,10 +346,12 @@ _TIMING_TOP, _TIMING_HEIGHT, _TIMING_BOTTOM = 28.0, 150.0, 40.0
 
 def timing_figures(evidence: Evidence, parameters: ParameterFile) -> list[Figure]:
     """Draw the sample timing of each recording, with the deviation of its steps where the parameter file has it."""
-    found = parameters.content.get("recording_quality", [])
-    known = {one["recording"]: float(one["jitter_seconds"]["standard_deviation"]) for one in found}
+    known = defaultdict[str, list[float]](list)  # recordings of one name follow each other as in the evidence
+    for one in parameters.content.get("recording_quality", []):
+        known[one["recording"]].append(float(one["jitter_seconds"]["standard_deviation"]))
     return [
-        _timing_figure(place, timing, known.get(timing.recording)) for place, timing in enumerate(evidence.timing, 1)
+        _timing_figure(place, timing, known[timing.recording].pop(0) if known[timing.recording] else None)
+        for place, timing in enumerate(evidence.timing, 1)
     ]
 
 
