@@ -403,14 +403,16 @@ def test_an_arm_whose_control_file_cannot_be_opened_says_what_to_do(daemon: Aske
     enter(daemon, "viewer")
     assert daemon.get("/api/v1/arms/threelink").json()["control_problem"] is None
     path = control_path(daemon.service.state, "threelink")
-    path.mkdir(parents=True)  # nobody can open it as a file
+    path.parent.mkdir(parents=True)
+    path.symlink_to(path)  # nobody can open it
     problem = daemon.get("/api/v1/arms/threelink").json()["control_problem"]
-    assert problem.startswith("arms/threelink/control: cannot be opened: Is a directory; it cannot be told whether")
+    assert problem.startswith("arms/threelink/control: cannot be opened: Too many levels of symbolic")
     assert problem.endswith("; then make it a file that the account running ident can read and write")
     for address in ("/", "/arms/threelink"):
         answer = daemon.get(address)
         assert (answer.status_code, complaints(answer.text)) == (200, [])
         assert answer.text.count(f"{problem}.</p>") == 1, address
+    assert daemon.get("/api/v1/arms/threelink/faults").status_code == 409  # not an empty list
     assert 'href="/arms/planar2"' in daemon.get("/").text
     assert 'ident_arm_moving{arm="threelink"} 1.0' in daemon.get("/metrics").text
 

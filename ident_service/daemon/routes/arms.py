@@ -183,7 +183,7 @@ def challenge(service: Serving, who: Operator, arm: ArmName) -> answers.Challeng
 @router.get("/arms/{arm}/faults")
 def list_faults(service: Serving, _: Viewer, arm: ArmName) -> list[answers.FaultAnswer]:
     """List the faults of an arm that nobody has acknowledged, the earliest first."""
-    return _arm(service, arm).faults
+    return _faults(service, known.known_arm(service.db, service.state, arm).name)
 
 
 @router.post("/arms/{arm}/faults/{code}/ack")
@@ -322,7 +322,7 @@ def get_home(service: Serving, _: Viewer, arm: ArmName) -> list[HomeJoint]:
 def _arm(service: Service, arm: str) -> answers.ArmAnswer:
     found = known.known_arm(service.db, service.state, arm)
     acts = acceptances(service.state, found.name)
-    config = found.config
+    config, problem = found.config, shown_control_problem(service, found.name)
     return answers.ArmAnswer(
         name=found.name,
         source="shipped" if found.source == "shipped" else "uploaded",
@@ -333,10 +333,14 @@ def _arm(service: Service, arm: str) -> answers.ArmAnswer:
         unattended_motion=config.unattended_motion,
         resources=list(known.resources(config)),
         moved_by=controlling_pid(control_path(service.state, found.name)),
-        control_problem=shown_control_problem(service, found.name),
-        faults=[answers.FaultAnswer(**asdict(one)) for one in arm_fault_store(service.state, found.name).remembered()],
+        control_problem=problem,
+        faults=[] if problem else _faults(service, found.name),
         accepted=answers.AcceptanceAnswer(**asdict(acts[-1])) if acts else None,
     )
+
+
+def _faults(service: Service, arm: str) -> list[answers.FaultAnswer]:
+    return [answers.FaultAnswer(**asdict(one)) for one in arm_fault_store(service.state, arm).remembered()]
 
 
 def shown_control_problem(service: Service, arm: str) -> str | None:

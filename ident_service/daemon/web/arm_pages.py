@@ -300,11 +300,12 @@ def list_arms(service: Serving, who: Viewer) -> Response:
     lines = []
     for row in known.arm_names(db):
         name = row["name"]
+        problem = arms.shown_control_problem(service, name)
         try:
             faults = len(arm_fault_store(service.state, name).latched())
         except IdentError:
-            faults = 1  # a damaged file prevents motion like a fault
-        facts, problem = arm_facts(service.state, row), arms.shown_control_problem(service, name)
+            faults = 0 if problem else 1  # a damaged file prevents motion like a fault
+        facts = arm_facts(service.state, row)
         used = row["source"] != "shipped" or name in worked or faults > 0 or problem is not None
         lines.append(
             {
