@@ -158,6 +158,8 @@ def plain_mistake(mistake: Mapping[str, Any]) -> str:
     if mistake["type"] in BOUNDS:
         words, key = BOUNDS[mistake["type"]]
         return f"must be {words} {mistake['ctx'][key]:.10g}, not {str(mistake['input'])[:60]}"
+    if mistake["type"] == "string_too_long":
+        return f"must have at most {mistake['ctx']['max_length']} characters, not {len(mistake['input'])}"
     if mistake["type"] != "string_pattern_mismatch":
         return str(mistake["msg"]).removeprefix("Value error, ")
     pattern = str(mistake.get("ctx", {}).get("pattern", ""))

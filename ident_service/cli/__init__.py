@@ -40,6 +40,7 @@ from ident_service.cli.output import (
     Answer,
     discard,
     enable_interrupts,
+    occupy_standard_streams,
     print_answer,
     print_error,
     print_to_person,
@@ -126,6 +127,7 @@ def _run(words: Sequence[str], *, completes: bool) -> int:
     """Run one verb, as `main`; complete its words instead where a shell asks for that and `completes`."""
     if completion.VARIABLE in os.environ and completes:
         completion.complete(parser())
+    occupy_standard_streams()
     enable_interrupts()
     if "IDENT_ENDS_WITH_INPUT" in os.environ:  # a daemon's computation
         from ident_service.model.limited_process import end_with_input

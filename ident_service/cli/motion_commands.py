@@ -138,6 +138,7 @@ def run_and_report(
     motion: Excitation | Destination,
     announcement: str,
     *,
+    warning: str = "",
     speed: float = 1.0,
     lease_seconds: float | None = None,
     stop_requested: Callable[[], bool],
@@ -150,6 +151,7 @@ def run_and_report(
         config: of the arm.
         motion: motion or destination.
         announcement: description of the motion, printed with the folder before it begins.
+        warning: lines that are printed when the open arm was found as it was checked, before it is energised.
         speed: share of the motion's own.
         lease_seconds: how long the arm moves on when this process is gone [s]; None for the ordinary one.
         stop_requested: function that is called several times per lease; True stops the motion.
@@ -160,6 +162,7 @@ def run_and_report(
     """
     from ident_service.excitation.motion_file import Excitation
     from ident_service.motion.command_channel import LEASE_SECONDS
+    from ident_service.motion.state_machine import State
     from ident_service.motion.ticket import read_ticket
     from ident_service.operations.motion_run import run_motion
     from ident_service.registry.state_folder import new_run_folder, ticket_path
@@ -182,6 +185,8 @@ def run_and_report(
     def entered(state_name: str) -> None:
         nonlocal words
         words = state_name
+        if warning and state_name == State.CHECKED.value:
+            tell(arguments, warning)
         tell(arguments, state_name)
 
     def moved(seconds: float) -> None:

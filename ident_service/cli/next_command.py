@@ -120,7 +120,7 @@ def next_after_error(arguments: argparse.Namespace, kind: type[IdentError], mess
     if "preflight" in message and not issubclass(kind, ArmFault):
         if arguments.word == "reidentify":  # which makes its own
             return f"next: {shell_line(arguments, ['reidentify', str(arm)])}\n"
-        slow = arguments.word in ("home", "recover")
+        slow = arguments.word in ("home", "recover") or getattr(arguments, "home", False)
         words = ["preflight", str(arm), *(["--home"] if slow else Ended(arguments, 0, {}, "").motion)]
     return f"next: {shell_line(arguments, words)}\n"
 
@@ -192,15 +192,21 @@ def _designed(ended: Ended) -> list[str]:
 
 
 def _preflown(ended: Ended) -> list[str]:
-    given = ended.given
-    if ended.code == VERDICT_NO and (said := ended.said.get("ticket")):
-        failed = " ".join(f"{one['reason']} {one['remedy']}" for one in said["checks"] if one["verdict"] == "failed")
+    given, ticket = ended.given, ended.said.get("ticket") or {"checks": ()}
+
+    def asks(verdict: str, verb: str) -> bool:
+        told = (f"{one['reason']} {one['remedy']}" for one in ticket["checks"] if one["verdict"] == verdict)
+        return f"`ident {verb} " in " ".join(told)
+
+    if ended.code == VERDICT_NO:
         for verb in ("set-home", "doctor"):
-            if f"`ident {verb} " in failed:
+            if asks("failed", verb):
                 return [verb, ended.arm]
     if given.scale or not ended.good or given.dry_run:
         return ["preflight", ended.arm, *(["--home"] if given.home else ended.motion)]
-    return ["home", ended.arm] if given.home else ["run", ended.arm, *ended.motion]
+    if given.home:
+        return ["home", ended.arm]
+    return ["design", ended.arm] if asks("passed", "design") else ["run", ended.arm, *ended.motion]
 
 
 def _after_run(ended: Ended) -> list[str]:

@@ -34,7 +34,7 @@ def styled(stream: TextIO | None, text: str, style: str) -> str:
 
     Colours are left out in pipes and files, in a terminal called `dumb`, and where `NO_COLOR` is set (no-color.org).
     """
-    if stream is None or not stream.isatty() or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
+    if not is_terminal(stream) or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
         return text
     return f"\x1b[{_STYLES[style]}m{text}\x1b[0m"
 
@@ -71,15 +71,20 @@ def _print_json(document: dict[str, Any]) -> None:
     write(sys.stdout, json.dumps(document, allow_nan=False) + "\n")
 
 
+def is_terminal(stream: TextIO | None) -> bool:
+    """Return whether a standard stream is open and a terminal."""
+    return stream is not None and not stream.closed and stream.isatty()
+
+
 def person_types() -> bool:
     """Return whether standard input is open and a terminal, so that a person can be asked."""
-    return sys.stdin is not None and sys.stdin.isatty()
+    return is_terminal(sys.stdin)
 
 
 def tell(arguments: argparse.Namespace, line: str) -> None:
     """Print a progress line above the bar or on stdout (`--json`: stderr); ignore that it cannot be written."""
     bar = getattr(arguments, "progress", None)
-    if bar is not None and sys.stdout is not None and sys.stdout.isatty() and bar.tell(line):
+    if bar is not None and is_terminal(sys.stdout) and bar.tell(line):
         return
     # With --json, stdout belongs to the one object.
     with suppress(OSError):
@@ -92,7 +97,7 @@ def write(stream: TextIO | None, text: str) -> None:
     Raises:
         OSError: anything else that keeps text from its place, a full disk for example.
     """
-    if stream is None:  # closed before we began
+    if stream is None or stream.closed:
         return
     try:
         stream.write(text)
@@ -156,6 +161,17 @@ def writable_state_folder(arguments: argparse.Namespace) -> Path:
     state = state_folder(arguments)
     require_private(state)
     return state
+
+
+def occupy_standard_streams() -> None:
+    """Open the null device as stdin, stdout or stderr where it is closed (`2>&-`), for this process and its children.
+
+    A file of ours would get its number else, and with it what a child prints; the recorder finds its memory by numbers.
+    """
+    with suppress(OSError):  # a stop goes on without it
+        while (fd := os.open(os.devnull, os.O_RDWR)) <= 2:  # the lowest number that is free
+            os.set_inheritable(fd, True)
+        os.close(fd)
 
 
 def enable_interrupts() -> None:

@@ -34,6 +34,7 @@ from ident_service.cli.output import (
     VERDICT_NO,
     Answer,
     StopOnSignal,
+    is_terminal,
     print_to_person,
     tell,
     writable_state_folder,
@@ -174,7 +175,7 @@ def _design(arguments: argparse.Namespace) -> Answer:
 
 def _progress(arguments: argparse.Namespace) -> Callable[[Progress], None]:
     """Return a callback that shows the progress of a search: a bar on a terminal, else a line every 10 s."""
-    step, terminal = step_of(arguments), sys.stderr is not None and sys.stderr.isatty() and not arguments.json
+    step, terminal = step_of(arguments), is_terminal(sys.stderr) and not arguments.json
     last = [-10.0]
 
     def show(progress: Progress) -> None:

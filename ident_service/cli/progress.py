@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Self
 
-from ident_service.cli.output import person_types, print_to_person
+from ident_service.cli.output import is_terminal, person_types, print_to_person
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -189,7 +189,7 @@ def _rich_bar() -> Progress:
 
 def progress_bar(arguments: argparse.Namespace) -> ProgressBar:
     """Create a verb's bar and set `arguments.progress` to it; it draws only on a terminal, and not for quick verbs."""
-    terminal = sys.stderr is not None and sys.stderr.isatty() and not arguments.json
+    terminal = is_terminal(sys.stderr) and not arguments.json
     silent = arguments.word in _WITHOUT | _AT_ONCE or getattr(arguments, "hold_to_run", False)
     bar = arguments.progress = ProgressBar(f"ident {arguments.word}", wanted=terminal and not silent)
     return bar

@@ -192,13 +192,16 @@ def _move_slowly(arguments: argparse.Namespace, config: ArmConfig, destination: 
         "hold": f"the arm is held until `{shell_line(arguments, ['supported', arguments.arm])}`, then lowered",
         "lower": f"the arm is held for {HOLD:g} s, then lowered until it rests",
     }.get(config.control.after_stop or "", f"the arm is held for {HOLD:g} s, then its drives brake it")
-    lease = requested_lease(arguments, config)
-    tell(arguments, f"{config.name}: keep out of its reach; at the end of the motion")
-    tell(arguments, f"{ends}. Ctrl-C stops.")
-    stopping = StopOnSignal()
+    lease, stopping = requested_lease(arguments, config), StopOnSignal()
     with stopping:
-        asked = stop_or_lapsed(stopping.requested, lease)
-        return run_and_report(arguments, config, destination, f"slowly {destination.value}", stop_requested=asked)
+        return run_and_report(
+            arguments,
+            config,
+            destination,
+            f"slowly {destination.value}",
+            warning=f"{config.name}: keep out of its reach; at the end of the motion\n{ends}. Ctrl-C stops.",
+            stop_requested=stop_or_lapsed(stopping.requested, lease),
+        )
 
 
 def _text(found: Recovery) -> str:

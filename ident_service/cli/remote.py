@@ -11,6 +11,7 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, nullcontext, suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +31,7 @@ from ident_service.cli.output import (
 from ident_service.cli.progress import step_of, typed_confirmation
 from ident_service.cli.remote_recordings import file_of, recording_reference, require_registered
 from ident_service.cli.remote_recordings import word_of_address as word_of_address
-from ident_service.errors import AccessRefused, ArmError, IdentError, UnknownId, UsageError
+from ident_service.errors import AccessRefused, ArmError, IdentError, MotionRefused, UnknownId, UsageError
 
 if TYPE_CHECKING:
     from ident_service.client import IdentClient
@@ -463,7 +464,14 @@ def typed_name(arguments: argparse.Namespace) -> str:
 
     Raises:
         UsageError: another word, or nobody to ask.
+        MotionRefused: the same of a preflight, which asks what it asks at the machine.
     """
+    if arguments.word == "preflight" and arguments.confirm is None:
+        from ident_service.preflight.watchdog import consent_refusal
+
+        if refused := consent_refusal(arguments.arm, partial(typed_confirmation, arguments)):
+            raise MotionRefused(f"{arguments.arm}: the preflight NEEDS YOU: {refused[0]}\n-> {refused[1]}")
+        return str(arguments.arm)
     what = "gets a new zero" if getattr(arguments, "zero", False) else "will move"
     what = "is lowered" if arguments.word == "supported" else what
     name = typed_confirmation(arguments, f"{arguments.arm} {what} where you may not see it. Type its name to confirm:")

@@ -47,6 +47,7 @@ from ident_service.daemon.web import (
     run_pages,
     session_pages,
 )
+from ident_service.daemon.web.forms import failure
 from ident_service.operations.acceptance import synchronise
 from ident_service.operations.deletion import remove_deleted
 from ident_service.registry.arms import register_shipped_arms
@@ -134,7 +135,7 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
         # `include_router` would make all models of the routes again, at the first request and in the event loop.
         app.router.routes.extend(router.routes)
     describe(app)
-    install_error_handlers(app)
+    install_error_handlers(app, failure)
     book = Connections() if connections is None else connections
     app.add_middleware(
         RequestGuardMiddleware,

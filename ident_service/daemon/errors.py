@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import logging
 import sqlite3
+from collections.abc import Callable
 from dataclasses import asdict
 from http import HTTPStatus
 from typing import Any, Final
 
-from fastapi import APIRouter, FastAPI, Request
+from fastapi import APIRouter, FastAPI, Request, Response
+from fastapi.concurrency import run_in_threadpool
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from fastapi.routing import APIRoute
@@ -80,8 +82,13 @@ def status_of(error: errors.IdentError) -> int:
     return next((status for kind, status in _STATUS if isinstance(error, kind)), 500)
 
 
-def install_error_handlers(app: FastAPI) -> None:
-    """Install the exception handlers that turn every error into a `Failure`."""
+def install_error_handlers(app: FastAPI, failure_page: Callable[[Request, int, str], Response]) -> None:
+    """Install the exception handlers that turn every error into a `Failure`, or an unknown page into a page.
+
+    Args:
+        app: the application.
+        failure_page: function that renders a failure from a request, a status and words.
+    """
 
     async def _resources(request: Request, error: Exception) -> JSONResponse:
         if (short := _short_of(request, error)) is None:
@@ -116,7 +123,10 @@ def install_error_handlers(app: FastAPI) -> None:
         return _answer(422, "InvalidRequest", said)
 
     @app.exception_handler(HTTPException)
-    async def _http(_: Request, error: HTTPException) -> JSONResponse:
+    async def _http(request: Request, error: HTTPException) -> Response:
+        path, accepted = request.url.path, request.headers.get("accept", "")
+        if error.status_code == HTTPStatus.NOT_FOUND and "text/html" in accepted and not path.startswith("/api/"):
+            return await run_in_threadpool(failure_page, request, 404, f"There is no page {path} here.")
         kind = _KINDS.get(error.status_code) or HTTPStatus(error.status_code).phrase.title().replace(" ", "")
         return _answer(error.status_code, kind, str(error.detail), dict(error.headers or {}))
 

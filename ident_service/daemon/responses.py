@@ -88,8 +88,9 @@ class AcceptanceAnswer(BaseModel):
 class ArmAnswer(ArmLine):
     """Arm with its state.
 
-    `moved_by` is the process that moves it, `resources` what a motion of it reserves, `simulated` whether it can
-    be commissioned by `simulate`, `unattended_motion` whether what is due may begin by itself.
+    `moved_by` is the process that moves it, `control_problem` why neither that nor `faults` can be told (null if they
+    can), `resources` what a motion of it reserves, `simulated` whether it can be commissioned by `simulate`,
+    `unattended_motion` whether what is due may begin by itself.
     """
 
     sha256: str
@@ -98,6 +99,7 @@ class ArmAnswer(ArmLine):
     unattended_motion: Literal["refused", "allowed"]
     resources: list[str]
     moved_by: int | None
+    control_problem: str | None
     faults: list[FaultAnswer]
     accepted: AcceptanceAnswer | None
 

@@ -152,9 +152,10 @@ class Row:
             values = {field.name: content[field.name] for field in fields(cls)}
             arrays = {key: _numbers(values[key]) for key in ("beta", "deviations", "noise", "torque")}
             covariances = tuple(_numbers(one) for one in values["covariances"])
+            warnings = tuple(values["warnings"])
         except (KeyError, TypeError, UnicodeDecodeError) as error:
             raise ValueError(f"no row: {error}") from None
-        return cls(**{**values, **arrays, "covariances": covariances, "warnings": tuple(values["warnings"])})
+        return cls(**{**values, **arrays, "covariances": covariances, "warnings": warnings})
 
 
 def _plain(value: Any) -> Any:

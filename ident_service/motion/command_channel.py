@@ -407,7 +407,8 @@ def is_control_file_in_use(control_file: Path) -> bool:
 def _unreachable(path: Path, error: OSError) -> DriverError:
     return DriverError(
         f"{path}: cannot be opened: {error.strerror}; it cannot be told whether the arm moves, and a process that "
-        "moves it was not reached over this file. If it moves, use the emergency stop"
+        "moves it was not reached over this file: if it moves, use the emergency stop; then make it a file that "
+        "the account running ident can read and write"
     )
 
 

@@ -257,15 +257,22 @@ class Ticket:
         """
         found = []
         no_motion = not subject.excitation_sha256
-        if codes := [
-            check.code
-            for check in self.checks
-            if check.verdict in (Verdict.FAILED, Verdict.NEEDS_PERSON)
-            and not (no_motion and check.code in ABOUT_THE_MOTION)
-        ]:
-            found.append(f"checks failed: {', '.join(codes)}")
-        elif codes := [code for code in INDISPENSABLE if Verdict.PASSED not in self._verdicts(code)]:
-            found.append(f"checks were not made: {', '.join(codes)}")
+        failed, asking = (
+            [
+                check.code
+                for check in self.checks
+                if check.verdict is verdict and not (no_motion and check.code in ABOUT_THE_MOTION)
+            ]
+            for verdict in (Verdict.FAILED, Verdict.NEEDS_PERSON)
+        )
+        left_out = [code for code in INDISPENSABLE if Verdict.PASSED not in self._verdicts(code)]
+        if failed:
+            found.append(f"checks failed: {', '.join(failed)}")
+        if asking:
+            codes = ", ".join(dict.fromkeys([*left_out, *asking]))
+            found.append(f"checks were left out, as nobody typed the arm's name: {codes}")
+        elif left_out and not failed:
+            found.append(f"checks were not made: {', '.join(left_out)}")
         if now < self.created:
             found.append("it was made in the future: a clock has been set")
         elif now >= self.expires:
@@ -274,8 +281,10 @@ class Ticket:
         if mine.arm != theirs.arm:
             found.append(f"it is for {mine.arm}, not for {theirs.arm}")
         for key, what in _HASHES.items():
-            if getattr(mine, key) != getattr(theirs, key) and not (no_motion and key == "excitation_sha256"):
-                found.append(f"{what} has changed since")
+            if getattr(mine, key) == getattr(theirs, key) or (no_motion and key == "excitation_sha256"):
+                continue
+            of_home = key == "excitation_sha256" and not mine.excitation_sha256
+            found.append("it is for the path home, not for a motion" if of_home else f"{what} has changed since")
         if mine.identities != theirs.identities:
             found.append(f"the drives are not those that were checked{_difference(mine.identities, theirs.identities)}")
         for was, now_is in ((mine.driver, theirs.driver), (mine.software, theirs.software)):
@@ -285,8 +294,9 @@ class Ticket:
     def require_valid_for(self, subject: Subject, now: datetime) -> None:
         """Raise MotionRefused with the reasons of `objections_to` where this ticket does not allow the motion now."""
         if why := self.objections_to(subject, now):
+            command = "`ident preflight` of this motion" if subject.excitation_sha256 else "`ident preflight --home`"
             raise MotionRefused(
-                f"the preflight ticket is not valid for this: {'; '.join(why)}; `ident preflight` makes a new one"
+                f"the preflight ticket is not valid for this: {'; '.join(why)}; {command} makes a new one"
             )
 
     def with_arm(self, subject: Subject) -> Subject:

@@ -71,6 +71,17 @@ def is_held(state: Path, arm: str) -> bool:
         return False
 
 
+def control_problem(state: Path, arm: str) -> str | None:
+    """Return why it cannot be told whether an arm moves, and what to do; None where its control file can be opened."""
+    try:
+        with ControlFile.reach(control_path(state, arm)):
+            return None
+    except UsageError:  # no process moves it
+        return None
+    except DriverError as error:
+        return str(error)
+
+
 def moving_arms(state: Path) -> list[str]:
     """Return the names of the arms that any process moves or holds, or whose control file cannot be opened."""
     return _reach(state, None, _pid_if_any)[0]

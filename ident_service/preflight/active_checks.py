@@ -371,12 +371,13 @@ def _of_friction(model: ArmModel, felt: Vector) -> Iterator[str]:
     dry = [k for k in range(len(felt)) if felt[k] > most[k]]
     if not dry:
         return
-    names, values = ", ".join(model.chain.names[k] for k in dry), ", ".join(f"{felt[k]:.2g}" for k in dry)
+    names = ", ".join(model.chain.names[k] for k in dry)
+    values = ", ".join(f"{felt[k]:.2g} {'N m' if model.chain.revolute[k] else 'N'}" for k in dry)
     share = max(math.ceil(100.0 * felt[k] / limits.torque[k]) for k in dry) / 100.0
     yield (
-        f"{names}: friction takes {values} N m or N, more than is expected. Where such a joint reverses it may stand so"
+        f"{names}: friction takes {values}, more than is expected. Where such a joint reverses it may stand so"
         " long that a run takes its encoder for frozen, and ends. Set design.friction_guess to"
-        f" [{share:g}, {guess[1]:g}], and design the motion again"
+        f" [{share:g}, {guess[1]:g}], and design the motion again: `ident design ARM`"
     )
 
 

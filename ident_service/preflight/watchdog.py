@@ -60,19 +60,28 @@ def consent_check(model: ArmModel, sample: Sample, confirm: Confirm) -> Check | 
         why = "the driver does not report drive states, so the watchdogs cannot be tested"
         remedy = "Nothing moves without this proof: have the driver report the state of each drive in `Sample.status`."
         return failed_check(CODE, why, remedy)
-    name = model.config.name
+    refused = consent_refusal(model.config.name, confirm)
+    return None if refused is None else Check(CODE, Verdict.NEEDS_PERSON, (), *refused)
+
+
+def consent_refusal(arm: str, confirm: Confirm) -> tuple[str, str] | None:
+    """Ask a person for an arm's name before it gets torque; return None if given, else (reason, remedy).
+
+    Args:
+        arm: name of the arm.
+        confirm: function that shows a question and returns what the person typed.
+    """
     typed = confirm(
         "Now the arm gets torque: it is held where it stands, and every joint moves a little. At the end the drives' "
         "own watchdog is tried, at rest and in a small motion: they hear no more of what it watches, must give up "
-        f"torque by themselves, and an arm without brakes sinks. If {name} is supported where it stands and nobody is "
+        f"torque by themselves, and an arm without brakes sinks. If {arm} is supported where it stands and nobody is "
         "within its reach, type its name: "
-    )
-    if typed.strip() == name:
+    ).strip()
+    if typed == arm:
         return None
-    wrong = f"{typed.strip()!r} is not" if typed.strip() else "nobody typed"
-    why = f"{wrong} the arm's name, {name}, so the arm got no torque and the drives' watchdog was not tried"
-    remedy = f"Support the arm, step out of its reach, check again and type its name when asked, or --confirm {name}."
-    return Check(CODE, Verdict.NEEDS_PERSON, (), why, remedy)
+    wrong = f"{typed!r} is not" if typed else "nobody typed"
+    why = f"{wrong} the arm's name, {arm}, so the arm got no torque and the drives' watchdog was not tried"
+    return why, f"Support the arm, step out of its reach, check again and type its name when asked, or --confirm {arm}."
 
 
 def watchdogs_of(arm: Arm, model: ArmModel) -> tuple[Watchdog, ...]:

@@ -157,7 +157,7 @@ MOST_EXPRESSIONS = 1000
 MOST_CHARACTERS = 2**18  # of all expressions
 _TABLE = (
     'a table from a paper is typed as {"format": "ident-parameters", "version": 1, "base_parameters": {"expressions": '
-    '["Lzz1 + 0.25*m2", "lx2"], "values": [0.9, 0.4]}}, as the README has it'
+    '["Lzz1 + 0.25*m2", "lx2"], "values": [0.9, 0.4]}}'
 )
 
 

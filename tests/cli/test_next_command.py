@@ -46,6 +46,7 @@ UNLIKE = PROBED | {"drivable": False}
 REFUSED = UNLIKE | {"can": {"problems": [{}]}}
 NOT_ZEROED = {"checks": [{"verdict": "failed", "reason": "ZERO is 0: then `ident set-home ARM`", "remedy": "Do this."}]}
 STALLED = {"checks": [{"verdict": "failed", "reason": "late", "remedy": "see what `ident doctor ARM` says."}]}
+RUBS = {"checks": [{"verdict": "passed", "reason": "design the motion again: `ident design ARM`", "remedy": ""}]}
 # Words of a verb, its exit code and answer, and the command that follows.
 TABLE: list[tuple[str, int, Mapping[str, Any], str]] = [
     ("config check planar2", 0, {}, "simulate planar2"),
@@ -108,6 +109,9 @@ TABLE: list[tuple[str, int, Mapping[str, Any], str]] = [
     ("preflight wam7_canopen --dry-run", 0, {}, "preflight wam7_canopen"),
     ("preflight wam7_pucks", 3, {"ticket": NOT_ZEROED}, "set-home wam7_pucks"),
     ("preflight a.yaml", 3, {"ticket": STALLED}, "doctor a.yaml"),
+    ("preflight a.yaml m.json", 0, {"ticket": RUBS}, "design a.yaml"),
+    ("preflight a.yaml --home", 0, {"ticket": RUBS}, "home a.yaml"),
+    ("preflight a.yaml", 3, {"ticket": RUBS}, "preflight a.yaml"),
     ("bus probe a.yaml --eds f", 0, {"drives": [PROBED]}, "config check a.yaml"),
     ("bus probe a.yaml", 0, {"drives": [PROBED]}, "preflight a.yaml --dry-run"),
     ("bus probe a.yaml", 3, {"drives": [PROBED, UNLIKE]}, "config check a.yaml"),
@@ -127,6 +131,7 @@ def test_the_next_command_fits_the_answer(words: str, code: int, said: Mapping[s
 ERRORS: list[tuple[str, IdentError, str]] = [
     ("run planar2 m.json", MotionRefused("no preflight ticket"), "next: ident preflight planar2 m.json\n"),
     ("home planar2", MotionRefused("no preflight ticket"), "next: ident preflight planar2 --home\n"),
+    ("preflight planar2 --home", MotionRefused("the preflight NEEDS YOU"), "next: ident preflight planar2 --home\n"),
     ("run planar2", MotionRefused("active faults"), "next: ident recover planar2\n"),
     ("run planar2", ArmFault("lease_lost", "x"), "next: ident recover planar2\n"),
     ("run planar2", UsageError("exists"), ""),

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from argparse import Namespace
 from collections.abc import Iterator
+from io import StringIO
 from pathlib import Path
 
 import pytest
@@ -43,6 +44,23 @@ def test_a_closed_stdout_changes_nothing() -> None:
         ["/bin/sh", "-c", f"exec '{sys.executable}' -c '{TALK}' >&-"], stderr=subprocess.PIPE, check=False
     )
     assert (done.returncode, done.stderr) == (3, b"")
+
+
+def test_no_file_of_ours_takes_the_place_of_a_closed_stream(tmp_path: Path) -> None:
+    """Children print into what has its number, and the recorder is told its memory by numbers."""
+    verb = "import os, sys, ident_service.cli as cli; cli.main(['completion', 'bash'])"
+    code = f"{verb}; sys.exit(os.open('{tmp_path}', os.O_RDONLY))"
+    for closed in (">&-", "2>&-", "<&- >&- 2>&-"):
+        done = subprocess.run(["/bin/sh", "-c", f'exec {sys.executable} -c "{code}" {closed}'], check=False)
+        assert done.returncode >= 3, closed
+
+
+def test_a_stream_that_was_closed_meanwhile_changes_no_exit_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("stdin", "stdout", "stderr"):
+        monkeypatch.setattr(sys, name, closed := StringIO())
+        closed.close()
+    assert cli.main(["config", "check", "nobody.yaml"]) == 2
+    assert cli.main(["config", "check", "planar2"]) == 0
 
 
 def test_a_full_disk_loses_no_answer_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -150,6 +150,7 @@ def test_another_kind_of_table_is_pointed_to_the_small_one(commissioned: Path, t
     code, _, err = ident("compare", commissioned / "accepted", path)
     assert code == 2
     assert 'a table from a paper is typed as {"format": "ident-parameters", "version": 1, "base_parameters"' in err
+    assert "README" not in err
     typed(path, base={"values": [0.4, "x"]})
     assert "a table from a paper" not in ident("compare", commissioned / "accepted", path)[2]
 

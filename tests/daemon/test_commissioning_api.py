@@ -246,12 +246,17 @@ def test_positions_of_an_arm_at_rest_are_reported_while_they_are_read(daemon: As
             assert joint["lowest"] - 1e-6 <= position <= joint["highest"] + 1e-6
     assert daemon.get(f"/api/v1/jobs/{job['id']}/log").text == "reading for 0.5 s, without torque\n"
     # A line that is being written is told when it is whole.
-    log = (daemon.service.state / "jobs" / job["id"] / "log").read_bytes()
+    file = daemon.service.state / "jobs" / job["id"] / "log"
+    log = file.read_bytes()
     (tmp_path / "log").write_bytes(log[:-10])
     first, offset = printed_samples(tmp_path, 0)
     (tmp_path / "log").write_bytes(log)
     rest, end = printed_samples(tmp_path, offset)
     assert (first, rest, end) == (told[:-1], told[-1:], len(log))
+    # Paths of this machine are told to nobody else.
+    description = next(word for word in row["words"] if word.endswith(".yaml"))
+    file.write_text(f"{daemon.service.state}/runs/x: of {description}\n", encoding="utf-8")
+    assert daemon.get(f"/api/v1/jobs/{job['id']}/log").text == f"runs/x: of {arm}\n"
 
 
 def test_why_an_arm_could_not_be_read_stands_on_its_page(daemon: Asked, arm: str) -> None:

@@ -410,6 +410,35 @@ def test_a_person_elsewhere_reads_what_one_at_the_machine_does(
         assert client.answer(next(client.jobs()).id)["steps"] == ["`ident preflight quick` for the next motion."]
 
 
+@pytest.mark.parametrize("typed", ["", "yes"])
+def test_a_preflight_elsewhere_asks_what_one_at_the_machine_does(
+    typed: str, state: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = list[str]()
+
+    def answer(question: str) -> str:
+        asked.append(question)
+        return typed
+
+    monkeypatch.setenv("IDENT_TOKEN", "none")
+    monkeypatch.setattr("builtins.input", answer)
+    monkeypatch.setattr("ident_service.cli.progress.person_types", lambda: True)
+    here, there = ["--state", str(state)], ["--state", str(state), "--server", "http://127.0.0.1:9"]
+    assert main(["preflight", "planar2", *here]) == 3
+    told = capsys.readouterr().out
+    assert main(["preflight", "planar2", *there]) == 3  # and nothing is sent
+    assert asked[0] == asked[1]
+    refused = capsys.readouterr().err
+    why, remedy = re.findall(r"(?m)(?:\w.* NEEDS YOU: |^-> )(.*)$", refused)
+    assert why in told
+    assert remedy in told
+    assert refused.endswith(f"\nnext: ident preflight planar2 {shlex.join(there)}\n")
+    monkeypatch.setattr("ident_service.cli.progress.person_types", lambda: False)
+    assert main(["preflight", "planar2", *there]) == 3
+    assert main(["preflight", "planar2", "--confirm", "other", *there]) == 2  # as at the machine
+    assert len(asked) == 2
+
+
 @pytest.mark.slow
 def test_a_fault_elsewhere_is_told_with_what_it_left(state: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = quick_text("faulty", 16).replace("driver:\n", "driver:\n  faults: [{kind: nan_position, at: 25}]\n", 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -123,6 +124,9 @@ def test_rows_tell_estimate_time_conditions_and_noise(rows: list[Row], usual: Ki
         assert np.all(np.abs(row.beta - beta)[known] < 6.0 * row.deviations[known])
         again = Row.from_json(row.to_json())
         assert again.to_json() == row.to_json()
+    for wrong in (None, 1):
+        with pytest.raises(ValueError, match="no row"):
+            Row.from_json(json.dumps(json.loads(rows[0].to_json()) | {"warnings": wrong}).encode())
 
 
 def test_factors_survive_the_file_bit_for_bit(rows: list[Row], described: Described, store: Store) -> None:

@@ -31,7 +31,7 @@ from ident_service.operations.run_archive import import_run
 from ident_service.recordings.open import open_recording
 from ident_service.registry import jobs as rows
 from ident_service.registry.runs import label_run
-from ident_service.registry.state_folder import arm_fault_store, arm_folder
+from ident_service.registry.state_folder import arm_fault_store, arm_folder, control_path
 from ident_service.registry.tokens import add_token
 from ident_service.results.manifest import write_manifest
 
@@ -398,6 +398,40 @@ def test_the_list_says_what_an_arm_is_and_what_comes_next(daemon: Asked, commiss
     assert answer.headers["content-security-policy"].startswith("default-src 'none'")
 
 
+def test_an_arm_whose_control_file_cannot_be_opened_says_what_to_do(daemon: Asked) -> None:
+    """It is shown as one that may move; the list shows the others, too."""
+    enter(daemon, "viewer")
+    assert daemon.get("/api/v1/arms/threelink").json()["control_problem"] is None
+    path = control_path(daemon.service.state, "threelink")
+    path.parent.mkdir(parents=True)
+    path.symlink_to(path)  # nobody can open it
+    problem = daemon.get("/api/v1/arms/threelink").json()["control_problem"]
+    assert problem.startswith("arms/threelink/control: cannot be opened: Too many levels of symbolic")
+    assert problem.endswith("; then make it a file that the account running ident can read and write")
+    for address in ("/", "/arms/threelink"):
+        answer = daemon.get(address)
+        assert (answer.status_code, complaints(answer.text)) == (200, [])
+        assert answer.text.count(f"{problem}.</p>") == 1, address
+    assert daemon.get("/api/v1/arms/threelink/faults").status_code == 409  # not an empty list
+    assert 'href="/arms/planar2"' in daemon.get("/").text
+    assert 'ident_arm_moving{arm="threelink"} 1.0' in daemon.get("/metrics").text
+
+
+def test_an_unknown_page_is_one_of_ours_in_a_browser(daemon: Asked) -> None:
+    browser = {"Accept": "text/html,application/xhtml+xml,*/*;q=0.8"}
+    for role in (None, "viewer"):
+        if role:
+            enter(daemon, role)
+        answer = daemon.get("/no<script>page", headers=browser)
+        assert answer.status_code == 404
+        assert complaints(answer.text) == []
+        assert "There is no page /no&lt;script&gt;page here." in answer.text
+        assert '<a href="/">the arms</a>' in answer.text
+        assert "default-src 'none'" in answer.headers["content-security-policy"]
+    assert daemon.get("/nopage").json()["error"]["kind"] == "NotFound"  # what a program asks
+    assert daemon.get("/api/v1/nothing", headers=browser).json()["error"]["kind"] == "NotFound"
+
+
 def test_an_arm_with_recordings_only_begins_at_identify(daemon: Asked) -> None:
     enter(daemon, "operator")
     page = daemon.get("/arms/ur10").text
@@ -456,6 +490,10 @@ def test_the_table_of_runs_is_searched_beyond_its_first_page(daemon: Asked) -> N
         assert "Earlier runs" not in page
     page, seen = daemon.get("/runs?kind=motion&text=r").text, list[str]()
     assert "<option>cold</option>" in page
+    assert "<option selected>warm</option>" in daemon.get("/runs?tag=warm").text  # which no run has
+    answer = daemon.get(f"/runs?tag={'x' * 41}")
+    assert answer.status_code == 422
+    assert ">tag: must have at most 40 characters, not 41</p>" in answer.text
     while True:
         seen += re.findall(r'href="/runs/(r\d+)"', page)
         if (earlier := re.search(r'href="(/runs\?[^"]*before=[^"]*)"', page)) is None:

@@ -60,7 +60,7 @@ def is_for_this_arm_only(ticket: Ticket) -> None:
     subject, now = ticket.subject, ticket.created
     assert ticket.objections_to(subject, now) == []
     assert ticket.objections_to(replace(subject, excitation="identification", excitation_sha256="0" * 64), now) == [
-        "the motion has changed since"
+        "it is for the path home, not for a motion"
     ]
     assert ticket.objections_to(replace(subject, model_sha256="0" * 64), now) != []
 

@@ -14,7 +14,7 @@ import pytest
 from flight_bench import flight_config, joint_changes
 
 from drivers.arm import ArmDescription
-from ident_service.errors import UsageError
+from ident_service.errors import MotionRefused, UsageError
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.ticket import (
@@ -65,7 +65,7 @@ def test_a_ticket_counts_for_what_was_checked_for_a_quarter_of_an_hour() -> None
     ("verdict", "reason"),
     [
         (failed_check("noise", "too much", "less"), "failed: noise"),
-        (Check("watchdog", Verdict.NEEDS_PERSON), "failed: watchdog"),
+        (Check("watchdog", Verdict.NEEDS_PERSON), "left out, as nobody typed the arm's name: watchdog"),
         *(
             (skipped_check(code, "could not be made"), f"not made: {code}")
             for code in ("gravity", "direction", "watchdog")
@@ -76,6 +76,27 @@ def test_a_ticket_that_did_not_pass_counts_for_nothing(verdict: Check, reason: s
     (found,) = ticket(verdict).objections_to(SUBJECT, later())
     assert reason in found
     assert ticket(verdict).verdict is not Verdict.PASSED
+
+
+def test_checks_that_want_a_person_are_not_said_to_have_failed() -> None:
+    why = "because nobody typed the arm's name"
+    person = Check("watchdog", Verdict.NEEDS_PERSON)
+    left_out = ticket(skipped_check("gravity", why), skipped_check("direction", why), person)
+    assert left_out.objections_to(SUBJECT, later()) == [
+        "checks were left out, as nobody typed the arm's name: gravity, direction, watchdog"
+    ]
+
+
+def test_a_ticket_for_the_path_home_says_so_to_a_motion() -> None:
+    home = subject_of(MODEL, None, ARM)
+    with pytest.raises(MotionRefused) as refused:
+        ticket(subject=home).require_valid_for(SUBJECT, later())
+    assert str(refused.value) == (
+        "the preflight ticket is not valid for this: it is for the path home, not for a motion; "
+        "`ident preflight` of this motion makes a new one"
+    )
+    with pytest.raises(MotionRefused, match="`ident preflight --home` makes a new one"):
+        ticket().require_valid_for(home, later(minutes=15))
 
 
 def test_failure_outweighs_a_missing_person_and_skipped_checks_pass() -> None:
@@ -121,7 +142,7 @@ def test_a_path_home_asks_for_nothing_that_is_about_the_motion(code: str) -> Non
 @pytest.mark.parametrize("check", [failed_check("direction", "x", "y"), Check("watchdog", Verdict.NEEDS_PERSON)])
 def test_a_path_home_asks_for_all_that_is_about_the_arm(check: Check) -> None:
     home = subject_of(MODEL, None, ARM)
-    assert f"failed: {check.code}" in ticket(check).objections_to(home, later())[0]
+    assert ticket(check).objections_to(home, later())[0].endswith(f": {check.code}")
     others = subject_of(MODEL, None, replace(ARM, identities=("a 1", "b 3")))
     assert "the drives are not those that were checked (axis 2: no longer b 2, now b 3)" in ticket().objections_to(
         others, later()

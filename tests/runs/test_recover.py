@@ -244,12 +244,20 @@ def test_home_keeps_the_rules_of_a_run(ident: Callable[..., tuple[int, str]], tm
     code, said = ident("home")
     assert code == 3
     assert "no preflight ticket" in said
+    assert "keep out of its reach" not in said  # nothing is going to move
+    assert ident("check", "--home")[0] == 3
+    code, said = ident("home")
+    assert code == 3
+    assert "as nobody typed the arm's name: gravity, direction, watchdog" in said
+    assert "keep out of its reach" not in said
     assert ident("check", "--home", "--confirm", "planar2")[0] == 0
     # A ticket for the path home is none for a motion.
     code, said = ident("run", "--out", str(tmp_path / "run"))
     assert code == 3
-    assert "the motion has changed since" in said
-    assert ident("home", "--out", str(tmp_path / "home"))[0] == 0
+    assert "it is for the path home, not for a motion" in said
+    code, said = ident("home", "--out", str(tmp_path / "home"))
+    assert code == 0
+    assert said.index("keep out of its reach") < said.index("armed")
     names = sorted(path.name for path in (tmp_path / "home").iterdir())
     assert names == ["arm.json", "ended.json", "manifest.json", "run.mcap", "ticket.json"]
     assert json.loads((tmp_path / "home" / "ended.json").read_text())["state"] == "done"

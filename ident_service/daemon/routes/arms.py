@@ -21,13 +21,14 @@ from ident_service.daemon.authentication import CHALLENGE_SECONDS
 from ident_service.daemon.dependencies import Operator, Service, Serving, Viewer
 from ident_service.daemon.errors import api_router, failures
 from ident_service.daemon.jobs.requests import ArmName, FileName, Id, RequestBody
+from ident_service.daemon.routes.jobs import without_paths
 from ident_service.errors import MotionRefused, UsageError
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.command_channel import controlling_pid
 from ident_service.operations import deletion
 from ident_service.operations.acceptance import accept, acceptances, rollback
 from ident_service.operations.description_process import describe_apart, draw_apart, judge_apart
-from ident_service.operations.moving_arms import Asked
+from ident_service.operations.moving_arms import Asked, control_problem
 from ident_service.registry import arms as known
 from ident_service.registry import motions
 from ident_service.registry.database import LONGEST_NOTE, note
@@ -182,7 +183,7 @@ def challenge(service: Serving, who: Operator, arm: ArmName) -> answers.Challeng
 @router.get("/arms/{arm}/faults")
 def list_faults(service: Serving, _: Viewer, arm: ArmName) -> list[answers.FaultAnswer]:
     """List the faults of an arm that nobody has acknowledged, the earliest first."""
-    return _arm(service, arm).faults
+    return _faults(service, known.known_arm(service.db, service.state, arm).name)
 
 
 @router.post("/arms/{arm}/faults/{code}/ack")
@@ -321,7 +322,7 @@ def get_home(service: Serving, _: Viewer, arm: ArmName) -> list[HomeJoint]:
 def _arm(service: Service, arm: str) -> answers.ArmAnswer:
     found = known.known_arm(service.db, service.state, arm)
     acts = acceptances(service.state, found.name)
-    config = found.config
+    config, problem = found.config, shown_control_problem(service, found.name)
     return answers.ArmAnswer(
         name=found.name,
         source="shipped" if found.source == "shipped" else "uploaded",
@@ -332,9 +333,20 @@ def _arm(service: Service, arm: str) -> answers.ArmAnswer:
         unattended_motion=config.unattended_motion,
         resources=list(known.resources(config)),
         moved_by=controlling_pid(control_path(service.state, found.name)),
-        faults=[answers.FaultAnswer(**asdict(one)) for one in arm_fault_store(service.state, found.name).remembered()],
+        control_problem=problem,
+        faults=[] if problem else _faults(service, found.name),
         accepted=answers.AcceptanceAnswer(**asdict(acts[-1])) if acts else None,
     )
+
+
+def _faults(service: Service, arm: str) -> list[answers.FaultAnswer]:
+    return [answers.FaultAnswer(**asdict(one)) for one in arm_fault_store(service.state, arm).remembered()]
+
+
+def shown_control_problem(service: Service, arm: str) -> str | None:
+    """Return the `control_problem` of an arm as others may read it, without paths of this machine."""
+    problem = control_problem(service.state, arm)
+    return None if problem is None else str(without_paths(problem, str(service.state)))
 
 
 def _ask(service: Service, who: str, arm: str, asked: Asked) -> answers.AskedAnswer:

@@ -159,7 +159,7 @@ def get_job(service: Serving, _: Viewer, job: Id) -> answers.JobAnswer:
 def get_log(service: Serving, _: Viewer, job: Id) -> PlainTextResponse:
     """Return the end of the log of a job."""
     row = rows.known_job(service.db, job)
-    return PlainTextResponse(process_output(service.state / JOBS / row["id"], MOST_LOG).log)
+    return PlainTextResponse(_named(process_output(service.state / JOBS / row["id"], MOST_LOG).log, service, row))
 
 
 @router.get("/jobs/{job}/result")

@@ -300,12 +300,13 @@ def list_arms(service: Serving, who: Viewer) -> Response:
     lines = []
     for row in known.arm_names(db):
         name = row["name"]
+        problem = arms.shown_control_problem(service, name)
         try:
             faults = len(arm_fault_store(service.state, name).latched())
         except IdentError:
-            faults = 1  # a damaged file prevents motion like a fault
+            faults = 0 if problem else 1  # a damaged file prevents motion like a fault
         facts = arm_facts(service.state, row)
-        used = row["source"] != "shipped" or name in worked or faults > 0
+        used = row["source"] != "shipped" or name in worked or faults > 0 or problem is not None
         lines.append(
             {
                 **row,
@@ -313,7 +314,8 @@ def list_arms(service: Serving, who: Viewer) -> Response:
                 "used": used,
                 "accepted": accepted.get(name),
                 "faults": faults,
-                "moving": is_control_file_in_use(control_path(service.state, name)),
+                "problem": problem,
+                "moving": problem is None and is_control_file_in_use(control_path(service.state, name)),
                 "last": last.get(name),
                 "alarms": sum(one["arm"] == name for one in standing),
                 "dues": sum(one["arm"] == name for one in due),

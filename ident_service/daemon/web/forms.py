@@ -70,7 +70,8 @@ def words_of(error: IdentError | RequestValidationError | ValidationError) -> st
     """Return what is wrong with a request in words: the error's own, or up to five mistakes found by pydantic."""
     if isinstance(error, IdentError):
         return str(error)
-    return "; ".join(f"{'.'.join(map(str, one['loc']))}: {plain_mistake(one)}" for one in error.errors()[:5])
+    found = [(".".join(str(part) for part in one["loc"] if part != "query"), one) for one in error.errors()[:5]]
+    return "; ".join(f"{place}: {plain_mistake(one)}" for place, one in found)
 
 
 def failure(request: Request, status: int, words: str) -> Response:

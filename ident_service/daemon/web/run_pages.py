@@ -248,7 +248,7 @@ def list_runs(
         earlier=earlier,
         arms=[row["arm"] for row in service.db.rows("SELECT DISTINCT arm FROM runs ORDER BY arm")],
         kinds=[row["kind"] for row in service.db.rows("SELECT DISTINCT kind FROM runs ORDER BY kind")],
-        tags=sorted({one for row in labels.values() for one in row["tags"]}),
+        tags=sorted({one for row in labels.values() for one in row["tags"]} | ({tag} - {""})),
         filled={"kind": kind, "tag": tag, "text": text},
         expressions=expressions,
         chosen=chosen,
