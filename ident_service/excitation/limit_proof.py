@@ -524,10 +524,10 @@ def tightened(task: Task, proof: Proof, limits: MotionLimits) -> Task | None:
 def scale_to_verified(
     basis: Basis,
     coefficients: Array,
-    standing_coefficients: Array,
+    safe_coefficients: Array,
     prove: Callable[[Array], Proof | None],
 ) -> tuple[Array, Proof] | None:
-    """Return a motion's coefficients and proof if proven, else of a smaller one; None if even 1 % of it is not.
+    """Return motion and proof, shrunk about its middle or else the safe posture if need be; None if 1 % is unproven.
 
     Sizes are tried ever more coarsely until one can be proven, then halfway back. That takes a few proofs, of seconds
     each, where one size after another would take twenty.
@@ -535,13 +535,13 @@ def scale_to_verified(
     Args:
         basis: the family.
         coefficients: of the motion, shape (joints, size).
-        standing_coefficients: coefficients of standing still in a posture that keeps all limits.
+        safe_coefficients: coefficients of standing still in a posture that keeps all limits.
         prove: the proof of a motion that keeps all limits, None for one that does not.
     """
     if (proof := prove(coefficients)) is not None:
         return coefficients, proof
     best: tuple[float, tuple[Array, Proof]] | None = None
-    for anchor in (basis.standing_at_middle(coefficients), standing_coefficients):
+    for anchor in (basis.standing_at_middle(coefficients), safe_coefficients):
         if best is not None and best[0] >= _LARGE:
             break  # where a motion's own middle is a bad place, little is left of it; the safe posture may leave more
         found: tuple[Array, Proof] | None = None

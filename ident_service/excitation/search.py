@@ -72,19 +72,19 @@ class Candidate:
     coefficients: Array
 
 
-def random_variables(problem: Problem, rng: np.random.Generator, standing_coefficients: Array) -> Array:
+def random_variables(problem: Problem, rng: np.random.Generator, safe_coefficients: Array) -> Array:
     """Return search variables of a random motion about a posture between the safe one and a random one.
 
     Args:
         problem: of the search.
         rng: of this start.
-        standing_coefficients: coefficients of standing still in a posture that keeps all limits.
+        safe_coefficients: coefficients of standing still in a posture that keeps all limits.
     """
     basis = problem.task.basis
     limits = problem.task.limits
     share = rng.uniform(0.0, 1.0) ** 2
     posture = rng.uniform(limits.lower, limits.upper)
-    middle = (1.0 - share) * standing_coefficients + share * basis.standing(posture)
+    middle = (1.0 - share) * safe_coefficients + share * basis.standing(posture)
     x = problem.variables(middle)
     noise = rng.normal(scale=_SPREAD, size=(len(posture), basis.size))
     return x + np.where(basis.moving, noise, 0.0).ravel()
@@ -93,7 +93,7 @@ def random_variables(problem: Problem, rng: np.random.Generator, standing_coeffi
 def local_search(
     problem: Problem,
     x: Array,
-    standing_coefficients: Array,
+    safe_coefficients: Array,
     start_number: int,
     check: Callable[[], None],
     *,
@@ -104,7 +104,7 @@ def local_search(
     Args:
         problem: of the search.
         x: variables to begin with, shape (problem.size,).
-        standing_coefficients: coefficients of standing still in a posture that keeps all limits.
+        safe_coefficients: coefficients of standing still in a posture that keeps all limits.
         start_number: number of the random start.
         check: called at every evaluation; what it raises ends the rounds.
         polish: True for a motion that is good already.
@@ -113,7 +113,7 @@ def local_search(
         InterruptedWithResult: `check` raised Interrupted; with the best of what the rounds had found until then.
     """
     if polish:
-        return _polished(problem, x, standing_coefficients, start_number, check)
+        return _polished(problem, x, safe_coefficients, start_number, check)
     state = problem.no_multipliers(1.0)
     reached, latest = [x], [x]
 
@@ -141,9 +141,9 @@ def local_search(
     except Interrupted:
         # An interrupted round may be far outside the limits; earlier points may be better.
         raise InterruptedWithResult(
-            _best_of([best_feasible(problem, one, standing_coefficients, start_number) for one in (*reached, *latest)])
+            _best_of([best_feasible(problem, one, safe_coefficients, start_number) for one in (*reached, *latest)])
         ) from None
-    return best_feasible(problem, x, standing_coefficients, start_number)
+    return best_feasible(problem, x, safe_coefficients, start_number)
 
 
 def _polished(problem: Problem, x: Array, safe: Array, start: int, check: Callable[[], None]) -> Candidate:
@@ -212,14 +212,11 @@ class InterruptedWithResult(Interrupted):
         super().__init__()
 
 
-def best_feasible(problem: Problem, x: Array, standing_coefficients: Array, start_number: int) -> Candidate:
-    """Return the best of the motions between x and standing still that keep all limits at the samples.
-
-    Standing still means in the motion's own middle, where that keeps the limits, or in the safe posture.
-    """
+def best_feasible(problem: Problem, x: Array, safe_coefficients: Array, start_number: int) -> Candidate:
+    """Shrink a motion of search variables x, about its middle or the safe posture, until samples keep all limits."""
     X = problem.coefficients(x)
     middle = problem.task.basis.standing_at_middle(X)
-    anchors = [middle, standing_coefficients] if within_limits(problem, middle) else [standing_coefficients]
+    anchors = [middle, safe_coefficients] if within_limits(problem, middle) else [safe_coefficients]
     return _best_of([_largest(problem, X, anchor, start_number) for anchor in anchors])
 
 

@@ -242,7 +242,7 @@ class Envelope:
         self._any = np.zeros((series, 0), bool)
 
     def add(self, time: Array, values: Array, marked: Mask) -> None:
-        """Add the next samples to the extremes of their stretches of time; stretches get longer if they are too many.
+        """Add samples, a row per series, to the extremes of their stretches of time; merge stretches if too many.
 
         Args:
             time: times, not decreasing, not below that of earlier samples [s], shape (samples,).
