@@ -46,7 +46,7 @@ class Fault:
         return slice(None) if self.joint is None else slice(self.joint, self.joint + 1)
 
     def strikes(self, cycle: int) -> bool:
-        """Return whether the fault strikes in this cycle, by its first cycle, its duration, or its kind's rule."""
+        """Return whether the fault strikes in this cycle; without a duration once or for good, by its kind's rule."""
         if cycle < self.at_cycle:
             return False
         if self.duration is None:

@@ -74,12 +74,12 @@ ROUTERS = (
 """Routers of the application, in the order in which they are included."""
 
 
-def create_app(settings: Settings, connections: Connections | None = None) -> FastAPI:
+def create_app(settings: Settings, http_connections: Connections | None = None) -> FastAPI:
     """Create the service as an ASGI application: open its database, with a first token, now; run jobs in its lifespan.
 
     Args:
         settings: settings of the service.
-        connections: connections of the listener that serves the application; None where something else counts them.
+        http_connections: connections of the listener that serves the application; None if others count them.
 
     Raises:
         UsageError: the state folder cannot be used.
@@ -136,7 +136,7 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
         app.router.routes.extend(router.routes)
     describe(app)
     install_error_handlers(app, failure)
-    book = Connections() if connections is None else connections
+    book = Connections() if http_connections is None else http_connections
     app.add_middleware(
         RequestGuardMiddleware,
         settings=settings,

@@ -171,7 +171,7 @@ def stiffer_gains(
     limits: MotionLimits,
     stable: Callable[[Array, Array], bool],
 ) -> dict[int, str]:
-    """Return phrases, by joint index, on stiffer kp and kd where following holds back, stable all together.
+    """Return, by joint that lags or is limited by its gains, stiffer kp and kd, or that none is stable, in words.
 
     Args:
         active_limits: the limits.

@@ -312,7 +312,7 @@ class Basis(Protocol):
 
     @property
     def moving(self) -> NDArray[np.bool_]:
-        """Return a mask of the coefficients that can make the arm move; others only set its place; (size,)."""
+        """Return a mask over one joint's coefficients, False for those that only set its place, shape (size,)."""
 
     def path(self, coefficients: Array) -> FourierPath | PosturePath:
         """Return the motion with coefficients of shape (joints, size)."""
@@ -321,7 +321,7 @@ class Basis(Protocol):
         """Return the coefficients of standing still at a posture of shape (joints,), shape (joints, size)."""
 
     def standing_at_middle(self, coefficients: Array) -> Array:
-        """Return the coefficients of standing still at the middle of a motion, shape (joints, size)."""
+        """Return the coefficients of standing still at q0, or at the mean of the postures, shape (joints, size)."""
 
     def samples(self, samples_per_period: int) -> tuple[Array, Array]:
         """Return times [s] at which to check limits, and the time that each counts for in the information [s]."""
@@ -343,7 +343,7 @@ class FourierBasis:
 
     @cached_property
     def moving(self) -> NDArray[np.bool_]:
-        """Return a mask that is True for all coefficients but the middle position, shape (size,)."""
+        """Return a mask over one joint's coefficients, False for its middle position alone, shape (size,)."""
         return np.arange(self.size) < 2 * self.harmonics
 
     def path(self, coefficients: Array) -> FourierPath:
@@ -357,7 +357,7 @@ class FourierBasis:
         return np.column_stack([np.zeros((len(posture), 2 * self.harmonics)), posture])
 
     def standing_at_middle(self, coefficients: Array) -> Array:
-        """Return the coefficients of standing still at a motion's middle position, shape (joints, size)."""
+        """Return the coefficients of standing still at the series' constant q0, shape (joints, size)."""
         return self.standing(coefficients[:, -1])
 
     def samples(self, samples_per_period: int) -> tuple[Array, Array]:

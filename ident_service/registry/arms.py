@@ -99,7 +99,7 @@ def known_arm(db: Database, state: Path, name: str) -> KnownArm:
 
 
 def description_path(state: Path, row: Row) -> Path:
-    """Return the file of an arm's description, of its row in the registry (name, source, folder).
+    """Return the YAML file of an arm's description by its row: the software's own if shipped, else in its folder.
 
     Raises:
         UsageError: it came with other software.

@@ -204,7 +204,7 @@ def loaded_parameters(
     payload_equations: Equations,
     recordings: Sequence[Mapping[str, str]],
 ) -> tuple[dict[str, Any], Array | None]:
-    """Return (content of `parameters.json` of the arm with its payload, link parameters (layout.size,) or None).
+    """Return (`parameters.json` of the arm with its payload, link parameters (layout.size,); None if none feasible).
 
     Args:
         content: content of the arm's parameter file.

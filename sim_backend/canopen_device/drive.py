@@ -497,7 +497,7 @@ class CanopenDrive:
 
     @property
     def released(self) -> bool:
-        """Return whether the drive is off and a host's NMT command has left it pre-operational."""
+        """Return whether the drive is off, and pre-operational because a host's NMT command put it there."""
         off = self.power.state is PowerState.SWITCH_ON_DISABLED
         return off and self.nmt.commanded and self.nmt.state is State.PRE_OPERATIONAL
 

@@ -96,7 +96,7 @@ def friction_curves(reference: ComparedSet, pair: Pair, pair_number: int) -> lis
 
 
 def z_figure(change: ParameterChange, pair_number: int) -> Figure:
-    """Draw every parameter's difference in standard deviations, on a scale that shows 1 as well as 1000."""
+    """Draw a pair's differences per parameter, in sigmas, on a scale for 1 and 1000; `pair_number` is for its slug."""
     size = len(change.z)
     shown = _squeezed(np.clip(change.z, -_LARGEST_Z, _LARGEST_Z))
     canvas = Canvas(WIDTH, _TOP + _HEIGHT + _BOTTOM)
