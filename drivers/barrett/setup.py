@@ -207,7 +207,7 @@ class FoundArm:
 
 
 def read_pucks(port: PropertyPort, driver: BarrettDriver, *, wakes: bool = True) -> FoundArm:
-    """Read version, role and settings of an arm's pucks, after waking those asleep; PositionUnknown unless `wakes`.
+    """Read version, role and settings of an arm's pucks, waking those asleep, or PositionUnknown if not to wake any.
 
     Args:
         port: port to the bus.

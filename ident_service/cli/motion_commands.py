@@ -151,7 +151,7 @@ def run_and_report(
         config: of the arm.
         motion: motion or destination.
         announcement: description of the motion, printed with the folder before it begins.
-        warning: lines that are printed when the open arm was found as it was checked, before it is energised.
+        warning: lines that are printed before the arm is opened, once it is not refused for want of a ticket.
         speed: share of the motion's own.
         lease_seconds: how long the arm moves on when this process is gone [s]; None for the ordinary one.
         stop_requested: function that is called several times per lease; True stops the motion.
@@ -162,7 +162,6 @@ def run_and_report(
     """
     from ident_service.excitation.motion_file import Excitation
     from ident_service.motion.command_channel import LEASE_SECONDS
-    from ident_service.motion.state_machine import State
     from ident_service.motion.ticket import read_ticket
     from ident_service.operations.motion_run import run_motion
     from ident_service.registry.state_folder import new_run_folder, ticket_path
@@ -177,6 +176,8 @@ def run_and_report(
     def begin() -> None:
         nonlocal begun
         begun = True
+        if warning:
+            tell(arguments, warning)
         tell(arguments, f"{config.name}: {announcement}, into {folder}")
 
     step, words, reached = step_of(arguments), "preparing the motion", 0.0
@@ -185,8 +186,6 @@ def run_and_report(
     def entered(state_name: str) -> None:
         nonlocal words
         words = state_name
-        if warning and state_name == State.CHECKED.value:
-            tell(arguments, warning)
         tell(arguments, state_name)
 
     def moved(seconds: float) -> None:
@@ -469,14 +468,14 @@ def _chosen(config: ArmConfig, motion: Path | None) -> Excitation:
 
 def _watch(arguments: argparse.Namespace) -> Answer:
     from ident_service.motion.arm_factory import make_arm
-    from ident_service.motion.command_channel import controlling_pid
+    from ident_service.motion.command_channel import ControlFile
     from ident_service.motion.read_only_monitor import watch
     from ident_service.operations.arm_checks import SampleLines, watch_document, watch_text
     from ident_service.registry.state_folder import control_path
 
     config = described_arm(arguments)
-    if (pid := controlling_pid(control_path(state_folder(arguments), config.name))) is not None:
-        raise DriverError(f"{config.name}: process {pid} is moving the arm; see its recording")
+    with suppress(UsageError), ControlFile.reach(control_path(state_folder(arguments), config.name)) as controls:
+        raise DriverError(f"{config.name}: process {controls.pid} is moving the arm; see its recording")
     stopping = StopOnSignal()
     step_of(arguments)("watching", seconds_left=arguments.seconds)
     with stopping:

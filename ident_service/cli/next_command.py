@@ -206,7 +206,9 @@ def _preflown(ended: Ended) -> list[str]:
         return ["preflight", ended.arm, *(["--home"] if given.home else ended.motion)]
     if given.home:
         return ["home", ended.arm]
-    return ["design", ended.arm] if asks("passed", "design") else ["run", ended.arm, *ended.motion]
+    if asks("passed", "design") and not ended.motion:  # once: the motion that is designed then is given
+        return ["design", ended.arm]
+    return ["run", ended.arm, *ended.motion]
 
 
 def _after_run(ended: Ended) -> list[str]:

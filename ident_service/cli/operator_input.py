@@ -107,7 +107,7 @@ def requested_lease(
     """
     if not arguments.lease_from_stdin:
         return None
-    if sys.stdin is None or sys.stdin.isatty():
+    if sys.stdin is None or sys.stdin.closed or sys.stdin.isatty():
         raise UsageError("--lease-from-stdin is for programs that hold a pipe to standard input")
     from ident_service.motion.arm_factory import make_arm
     from ident_service.motion.command_channel import LEASE_SECONDS

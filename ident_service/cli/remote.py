@@ -11,7 +11,6 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, nullcontext, suppress
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -131,7 +130,7 @@ def remote_job(
         plain = {name: getattr(arguments, name) for name in argument_names.split()}
         return {"kind": kind} | plain | {name: read(client, arguments) for name, read in fields.items()}
 
-    return remote_verb(f"{argument_names} {further_arguments}", job_verb(make, ended))
+    return remote_verb(f"{argument_names} {further_arguments}", job_verb(make, ended, kind))
 
 
 def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
@@ -171,20 +170,27 @@ def telling_of_arm(arm: str, job: str) -> Iterator[None]:
         raise left_alone(gone, arm, job) from None
 
 
-def job_verb(make: Callable[[IdentClient, argparse.Namespace], dict[str, Any]], ended: Ended | None = None) -> Verb:
+def job_verb(
+    make: Callable[[IdentClient, argparse.Namespace], dict[str, Any]],
+    ended: Ended | None = None,
+    kind: str | None = None,
+) -> Verb:
     """Return a verb's function: it queues the job that `make` returns (if it moves, confirmed first), waits, answers.
 
     Args:
         make: the job of the words; its kind is the verb if it does not say another.
         ended: function that turns the job's answer into the verb's; the job's own answer when None.
+        kind: kind of the job where that is known before it is made; of one that moves the arm's name is asked for
+            first, before `make` uploads anything. The verb when None.
     """
 
     def verb(client: IdentClient, arguments: argparse.Namespace) -> Answer:
+        name = typed_name(arguments) if (kind or arguments.word) in _MOVE else None
         job = {key: value for key, value in make(client, arguments).items() if value is not None}
         body: dict[str, Any] = {"job": {"kind": arguments.word, **job}}
         moves = body["job"]["kind"] in _MOVE
         if moves:
-            body["confirm"] = confirmation(client, arguments)
+            body["confirm"] = confirmation(client, arguments, name)
         made = client.post("/api/v1/jobs", body)
         tell(arguments, f"job {made['id']}")
         with telling_of_arm(arguments.arm, made["id"]) if moves else nullcontext():
@@ -469,7 +475,10 @@ def typed_name(arguments: argparse.Namespace) -> str:
     if arguments.word == "preflight" and arguments.confirm is None:
         from ident_service.preflight.watchdog import consent_refusal
 
-        if refused := consent_refusal(arguments.arm, partial(typed_confirmation, arguments)):
+        def ask(question: str) -> str:
+            return typed_confirmation(arguments, f"It is where you may not see it: type only what you see. {question}")
+
+        if refused := consent_refusal(arguments.arm, ask):
             raise MotionRefused(f"{arguments.arm}: the preflight NEEDS YOU: {refused[0]}\n-> {refused[1]}")
         return str(arguments.arm)
     what = "gets a new zero" if getattr(arguments, "zero", False) else "will move"

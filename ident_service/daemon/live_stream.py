@@ -27,9 +27,8 @@ _LOG_BYTES = 64 * 1024
 
 
 def log_of(service: Service, row: Row) -> str:
-    """Return the end of what a job's process has printed, without paths of this machine."""
-    log: str = jobs.without_paths(process_output(service.state / JOBS / row["id"], _LOG_BYTES).log, str(service.state))
-    return log
+    """Return the end of what a job's process has printed, its arm by name, paths relative to the state folder."""
+    return str(jobs.named_values(process_output(service.state / JOBS / row["id"], _LOG_BYTES).log, service, row))
 
 
 def _shown(service: Service, row: Row) -> str:

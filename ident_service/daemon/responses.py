@@ -88,9 +88,9 @@ class AcceptanceAnswer(BaseModel):
 class ArmAnswer(ArmLine):
     """Arm with its state.
 
-    `moved_by` is the process that moves it, `control_problem` why neither that nor `faults` can be told (null if they
-    can), `resources` what a motion of it reserves, `simulated` whether it can be commissioned by `simulate`,
-    `unattended_motion` whether what is due may begin by itself.
+    `moved_by` is the process that moves it, `control_problem` why that cannot be told (null if it can); `faults` are
+    null if they cannot be told either. `resources` is what a motion of it reserves, `simulated` whether it can be
+    commissioned by `simulate`, `unattended_motion` whether what is due may begin by itself.
     """
 
     sha256: str
@@ -100,7 +100,7 @@ class ArmAnswer(ArmLine):
     resources: list[str]
     moved_by: int | None
     control_problem: str | None
-    faults: list[FaultAnswer]
+    faults: list[FaultAnswer] | None
     accepted: AcceptanceAnswer | None
 
 

@@ -269,7 +269,7 @@ class Ticket:
         if failed:
             found.append(f"checks failed: {', '.join(failed)}")
         if asking:
-            codes = ", ".join(dict.fromkeys([*left_out, *asking]))
+            codes = ", ".join(code for code in dict.fromkeys([*left_out, *asking]) if code not in failed)
             found.append(f"checks were left out, as nobody typed the arm's name: {codes}")
         elif left_out and not failed:
             found.append(f"checks were not made: {', '.join(left_out)}")

@@ -22,8 +22,8 @@ Array = NDArray[np.float64]
 
 SATURATED: Final = 0.999  # of the limit
 PLATEAU: Final = 5  # so many samples in a row exactly at the extreme value look like a limit where none is known
-# Read in whole steps, a wave that turns round in its largest step is in the step below for at least 0.41 of that time;
-# one that is cut off three steps or more below its top, for at most 0.15.
+# Read in whole steps, a wave that turns round in its largest step is in the step below, just before and after, for at
+# least 0.41 of that time; one that is cut off four steps or more below its top, for less than 0.15.
 _BELOW_A_PLATEAU: Final = 0.15
 STANDSTILL: Final = 0.005  # [rad/s or m/s]
 STANDSTILL_OVER: Final = 0.02  # [s]
@@ -65,7 +65,7 @@ class JointQuality:
         name: name of the joint, or its number from 1.
         saturated: share of samples at the torque limit, or, where that is more, `clipped`.
         clipped: share of samples that sit exactly at the extreme torque five times in a row or more while the joint
-            moves; 0 where a wave that turns round in coarse steps of torque does so too.
+            moves; 0 where it looks like a wave that turns round in coarse steps of torque.
         standstill: share of the time that the joint is slower than 0.005 rad/s or m/s over 20 ms.
         position: smallest and largest [rad or m].
         position_at: times of these positions [s after the first sample].
@@ -328,41 +328,54 @@ def _wider(extremes: tuple[Array, Array], values: Matrix) -> tuple[Array, Array]
 
 
 class _Plateau:
-    """Count the samples in long runs at the largest value seen so far, and those at the next smaller value."""
+    """Count samples in long runs at the largest value seen so far, and those at the next one just before and after."""
 
     def __init__(self) -> None:
         self._value, self._below = -np.inf, -np.inf
-        self._at_value, self._at_below = 0, 0  # samples
-        self._counted = 0
-        self._run = 0  # samples at the value at the end of what was seen
+        self._long, self._beside = 0, 0  # samples in long runs at the value, and at the next one around these
+        # Of the stretch at the two largest values that has not ended: its present run at the largest, long runs before
+        # it, and samples at the next.
+        self._run, self._open_long, self._open_beside = 0, 0, 0
 
     def add(self, values: Array, counts: NDArray[np.bool_]) -> None:
         """Add the next samples, and which of them count, shapes (samples,)."""
         if (largest := float(values.max())) > self._value:
-            self._below, self._at_below = self._value, self._at_value
-            self._value, self._at_value = largest, 0
-            self._counted, self._run = 0, 0
+            self._value, self._below = largest, self._value
+            self._long, self._beside = 0, 0
+            self._run, self._open_long, self._open_beside = 0, 0, self._run
         if (below := float(values[values < self._value].max(initial=-np.inf))) > self._below:
-            self._below, self._at_below = below, 0
-        self._at_below += int(counts[values == self._below].sum())
-        at_value = np.concatenate([[False], (values == self._value) & counts, [False]])
-        self._at_value += int(at_value.sum())
-        edges = np.flatnonzero(np.diff(at_value))
-        begins, lengths = edges[::2], edges[1::2] - edges[::2]
-        if len(begins) and begins[0] == 0:
-            lengths[0] += self._run
-        elif self._run:
-            self._counted += self._run if self._run >= PLATEAU else 0
-        open_end = bool(at_value[-2])
-        closed = lengths[:-1] if open_end else lengths
-        self._counted += int(closed[closed >= PLATEAU].sum())
-        self._run = int(lengths[-1]) if open_end else 0
+            if not self._run:
+                self._end_stretch()
+            self._below, self._beside, self._open_beside = below, 0, 0
+        levels = np.where(values == self._value, 2, values == self._below) * counts
+        begins = np.flatnonzero(np.diff(levels, prepend=-1))
+        lengths = np.diff(begins, append=len(levels))
+        for level, length in zip(levels[begins].tolist(), lengths.tolist(), strict=True):
+            if level == 2:
+                self._run += length
+                continue
+            self._end_run()
+            if level == 1:
+                self._open_beside += length
+            else:
+                self._end_stretch()
+
+    def _end_run(self) -> None:
+        self._open_long += self._run if self._run >= PLATEAU else 0
+        self._run = 0
+
+    def _end_stretch(self) -> None:
+        self._end_run()
+        if self._open_long:
+            self._long += self._open_long
+            self._beside += self._open_beside
+        self._open_long, self._open_beside = 0, 0
 
     def samples(self, step: float) -> int:
         """Return the number of samples in runs of at least `PLATEAU`; 0 for the top of a wave in such coarse steps."""
-        found = self._counted + (self._run if self._run >= PLATEAU else 0)
-        one_below = self._at_below if self._value - self._below < 1.5 * step else 0
-        return found if one_below <= _BELOW_A_PLATEAU * found else 0
+        self._end_stretch()
+        beside = self._beside if self._value - self._below < 1.5 * step else 0
+        return self._long if beside <= _BELOW_A_PLATEAU * self._long else 0
 
 
 class _Rests:

@@ -90,10 +90,11 @@ def known_arm(db: Database, state: Path, name: str) -> KnownArm:
         if db.row("SELECT 1 FROM arms WHERE name = ?", name) is None:  # deleted meanwhile
             raise UnknownId(f"no arm {name!r} is known; see the list of arms") from None
         raise
-    if row["sha256"] != config.sha256:
+    needed = json.dumps(resources(config))  # what they are may change with this software, too
+    if (row["sha256"], row["resources"]) != (config.sha256, needed):
         db.write(
             "UPDATE arms SET sha256 = ?, description = ?, resources = ? WHERE name = ?",
-            *(config.sha256, config.description, json.dumps(resources(config)), name),
+            *(config.sha256, config.description, needed, name),
         )
     return KnownArm(name, path, config, row["source"])
 

@@ -427,7 +427,7 @@ def test_a_preflight_elsewhere_asks_what_one_at_the_machine_does(
     assert main(["preflight", "planar2", *here]) == 3
     told = capsys.readouterr().out
     assert main(["preflight", "planar2", *there]) == 3  # and nothing is sent
-    assert asked[0] == asked[1]
+    assert asked[1] == f"It is where you may not see it: type only what you see. {asked[0]}"
     refused = capsys.readouterr().err
     why, remedy = re.findall(r"(?m)(?:\w.* NEEDS YOU: |^-> )(.*)$", refused)
     assert why in told
@@ -435,6 +435,9 @@ def test_a_preflight_elsewhere_asks_what_one_at_the_machine_does(
     assert refused.endswith(f"\nnext: ident preflight planar2 {shlex.join(there)}\n")
     monkeypatch.setattr("ident_service.cli.progress.person_types", lambda: False)
     assert main(["preflight", "planar2", *there]) == 3
+    motion = state / "motion.json"
+    motion.write_text("{}")
+    assert main(["preflight", "planar2", str(motion), *there]) == 3  # nor is the motion sent
     assert main(["preflight", "planar2", "--confirm", "other", *there]) == 2  # as at the machine
     assert len(asked) == 2
 

@@ -74,9 +74,9 @@ def test_saturation(samples: int, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_touch_of_the_extreme_is_no_saturation() -> None:
     torque = np.zeros((1000, 1))
-    torque[::2] -= 0.5
     torque[100:104] = 1.0
     torque[500:504] = 1.0
+    torque[::2] -= 0.5
     recording = MadeRecording(MILLISECONDS[:1000], np.arange(1000.0)[:, None], torque)
     assert quality(recording, PLAIN).joints[0].saturated == 0.0
     torque[700:705] = 1.0
@@ -95,6 +95,21 @@ def test_the_round_top_of_a_slow_wave_in_coarse_steps_is_no_saturation(step: flo
     whole, cut = quality(MadeRecording(MILLISECONDS, position, torque), PLAIN).joints
     assert whole.saturated == 0.0
     assert cut.saturated == pytest.approx(float((torque[:, 1] == torque[:, 1].max()).mean()), rel=0.2)
+
+
+@pytest.mark.parametrize("samples", [4096, 37, 1])
+def test_humps_that_end_a_step_below_the_others_hide_no_saturation(
+    samples: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Waves of growing height: some end in the step below that at which the higher ones are cut."""
+    height = np.repeat(np.linspace(5.0, 20.0, 20), 500)
+    wave = height * np.sin(2 * np.pi * MILLISECONDS * 1e-9 / 0.5)
+    torque = np.round(np.minimum(wave, 12.0) / 0.5) * 0.5
+    recording = MadeRecording(MILLISECONDS, np.arange(10_000)[:, None] * 1e-3, torque[:, None])
+    blocks = recording.blocks
+    monkeypatch.setattr(recording, "blocks", lambda: blocks(samples))
+    found = quality(recording, PLAIN).joints[0]
+    assert found.clipped == pytest.approx(float((torque == 12.0).mean()), rel=0.1)
 
 
 @pytest.mark.slow

@@ -399,7 +399,7 @@ def test_the_list_says_what_an_arm_is_and_what_comes_next(daemon: Asked, commiss
 
 
 def test_an_arm_whose_control_file_cannot_be_opened_says_what_to_do(daemon: Asked) -> None:
-    """It is shown as one that may move; the list shows the others, too."""
+    """The list shows the others, too."""
     enter(daemon, "viewer")
     assert daemon.get("/api/v1/arms/threelink").json()["control_problem"] is None
     path = control_path(daemon.service.state, "threelink")
@@ -412,7 +412,11 @@ def test_an_arm_whose_control_file_cannot_be_opened_says_what_to_do(daemon: Aske
         answer = daemon.get(address)
         assert (answer.status_code, complaints(answer.text)) == (200, [])
         assert answer.text.count(f"{problem}.</p>") == 1, address
+    assert daemon.get("/api/v1/arms/threelink").json()["faults"] is None
     assert daemon.get("/api/v1/arms/threelink/faults").status_code == 409  # not an empty list
+    enter(daemon, "operator")
+    assert "Watch it for a minute" not in daemon.get("/arms/threelink").text
+    assert "Watch it for a minute" in daemon.get("/arms/planar2").text
     assert 'href="/arms/planar2"' in daemon.get("/").text
     assert 'ident_arm_moving{arm="threelink"} 1.0' in daemon.get("/metrics").text
 

@@ -22,7 +22,7 @@ from ident_service.daemon.dependencies import Operator, Service, Serving, Viewer
 from ident_service.daemon.errors import api_router, failures
 from ident_service.daemon.jobs.requests import ArmName, FileName, Id, RequestBody
 from ident_service.daemon.routes.jobs import without_paths
-from ident_service.errors import MotionRefused, UsageError
+from ident_service.errors import DriverError, MotionRefused, UsageError
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.command_channel import controlling_pid
 from ident_service.operations import deletion
@@ -323,6 +323,12 @@ def _arm(service: Service, arm: str) -> answers.ArmAnswer:
     found = known.known_arm(service.db, service.state, arm)
     acts = acceptances(service.state, found.name)
     config, problem = found.config, shown_control_problem(service, found.name)
+    try:
+        faults = _faults(service, found.name)
+    except DriverError:
+        if problem is None:
+            raise
+        faults = None
     return answers.ArmAnswer(
         name=found.name,
         source="shipped" if found.source == "shipped" else "uploaded",
@@ -334,7 +340,7 @@ def _arm(service: Service, arm: str) -> answers.ArmAnswer:
         resources=list(known.resources(config)),
         moved_by=controlling_pid(control_path(service.state, found.name)),
         control_problem=problem,
-        faults=[] if problem else _faults(service, found.name),
+        faults=faults,
         accepted=answers.AcceptanceAnswer(**asdict(acts[-1])) if acts else None,
     )
 

@@ -159,7 +159,7 @@ def get_job(service: Serving, _: Viewer, job: Id) -> answers.JobAnswer:
 def get_log(service: Serving, _: Viewer, job: Id) -> PlainTextResponse:
     """Return the end of the log of a job."""
     row = rows.known_job(service.db, job)
-    return PlainTextResponse(_named(process_output(service.state / JOBS / row["id"], MOST_LOG).log, service, row))
+    return PlainTextResponse(named_values(process_output(service.state / JOBS / row["id"], MOST_LOG).log, service, row))
 
 
 @router.get("/jobs/{job}/result")
@@ -167,7 +167,9 @@ def get_result(service: Serving, _: Viewer, job: Id) -> answers.JobResult:
     """Return the JSON answer and the text that the command of a job has printed."""
     row = rows.known_job(service.db, job)
     output = process_output(service.state / JOBS / row["id"])
-    return answers.JobResult(job=row["id"], **_named({"answer": output.answer, "text": output.text}, service, row))
+    return answers.JobResult(
+        job=row["id"], **named_values({"answer": output.answer, "text": output.text}, service, row)
+    )
 
 
 @router.get("/jobs/{job}/events", response_class=StreamingResponse, responses=_STREAM)
@@ -237,8 +239,8 @@ def job_answer_document(service: Service, row: Row) -> answers.JobAnswer:
     """Make the API's answer on a job from its row: state, progress, what it waits for; no paths of this machine."""
     found = service.engine.progress(row)
     shown = {key: value for key, value in row.items() if key in answers.JobAnswer.model_fields}
-    shown["detail"] = _named(row["detail"], service, row)
-    progress = None if found is None else _named(asdict(found), service, row)
+    shown["detail"] = named_values(row["detail"], service, row)
+    progress = None if found is None else named_values(asdict(found), service, row)
     moves = bool(row["motion"]) and (row["state"] == "running" or is_end_unobserved(row))
     held = moves and is_held(service.state, str(row["arm"]))
     if held and progress is not None:  # it ends when a person says so
@@ -250,12 +252,12 @@ def job_answer_document(service: Service, row: Row) -> answers.JobAnswer:
             shown["detail"] += f", which holds {held_until(other['arm'])}"
     unentered, code = service.engine.live.unentered(row["id"]) if row["state"] == "running" else ("", None)
     if unentered:
-        shown["detail"], shown["exit_code"], progress = _named(unentered, service, row), code, None
+        shown["detail"], shown["exit_code"], progress = named_values(unentered, service, row), code, None
     return answers.JobAnswer(**{**shown, "progress": progress, "held": held})
 
 
-def _named(value: Any, service: Service, row: Row) -> Any:
-    """Values of a job as others may read them: its arm by name, in commands too, and no places of this machine."""
+def named_values(value: Any, service: Service, row: Row) -> Any:
+    """Return a job's values with its arm by name, in commands too, and paths relative to the state folder."""
     described = {word: row["arm"] for word in row["words"] if word.startswith("/") and word.endswith(".yaml")}
     return without_paths(value, str(service.state), described if row["arm"] is not None else {})
 

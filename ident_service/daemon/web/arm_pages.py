@@ -40,7 +40,7 @@ from ident_service.daemon.web.arm_facts import (
 from ident_service.daemon.web.forms import Form, PageRoute, see_other
 from ident_service.daemon.web.reidentification_pages import compared
 from ident_service.daemon.web.render import page, picture, when
-from ident_service.errors import IdentError, MotionRefused, UsageError
+from ident_service.errors import DriverError, IdentError, MotionRefused, UsageError
 from ident_service.motion.command_channel import is_control_file_in_use
 from ident_service.motion.ticket import Verdict, read_ticket
 from ident_service.operations import maintenance_schedule as planned
@@ -303,8 +303,11 @@ def list_arms(service: Serving, who: Viewer) -> Response:
         problem = arms.shown_control_problem(service, name)
         try:
             faults = len(arm_fault_store(service.state, name).latched())
-        except IdentError:
-            faults = 0 if problem else 1  # a damaged file prevents motion like a fault
+            moving = is_control_file_in_use(control_path(service.state, name))
+        except DriverError:  # `problem` says why
+            faults, moving = 0, False
+        except IdentError:  # a damaged file prevents motion like a fault
+            faults, moving = 1, is_control_file_in_use(control_path(service.state, name))
         facts = arm_facts(service.state, row)
         used = row["source"] != "shipped" or name in worked or faults > 0 or problem is not None
         lines.append(
@@ -315,7 +318,7 @@ def list_arms(service: Serving, who: Viewer) -> Response:
                 "accepted": accepted.get(name),
                 "faults": faults,
                 "problem": problem,
-                "moving": problem is None and is_control_file_in_use(control_path(service.state, name)),
+                "moving": moving,
                 "last": last.get(name),
                 "alarms": sum(one["arm"] == name for one in standing),
                 "dues": sum(one["arm"] == name for one in due),
