@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from ident_service.estimation.identify import Estimate
-from ident_service.estimation.least_squares import TorqueError
+if TYPE_CHECKING:  # the list of runs assesses files, and is not to wait for what estimates need
+    from ident_service.estimation.identify import Estimate
+    from ident_service.estimation.least_squares import TorqueError
 
 Word = Literal["use", "use with care", "do not use"]
 

@@ -20,7 +20,7 @@ from functools import cache
 from importlib.resources import files
 from itertools import islice
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import jsonschema_rs
 import numpy as np
@@ -29,16 +29,15 @@ from ident_service import __version__
 from ident_service.certificate_verifier import INERTIAL, JOINT_TERMS, VerificationError, split_name
 from ident_service.config.arm import ArmConfig
 from ident_service.errors import ParameterError, UsageError
-from ident_service.estimation.certificate import certify
-from ident_service.estimation.feasible.feasible_set import SetName
-from ident_service.estimation.identify import Estimate
 from ident_service.model.base_parameters import BaseParameters, base_from_expressions, parse_expression
 from ident_service.model.chain import Array
 from ident_service.model.information import Information
 from ident_service.model.notation import NOTATIONS, Notation, regrouped, translate
-from ident_service.results.assessment import error_document
 from ident_service.results.manifest import write_atomically
-from ident_service.results.summary import how_fitted, implausible_links, torque_constants_document
+
+if TYPE_CHECKING:
+    from ident_service.estimation.feasible.feasible_set import SetName
+    from ident_service.estimation.identify import Estimate
 
 
 def strict_json(text: str) -> Any:
@@ -198,20 +197,9 @@ def read_parameters(
     """
     if parameter_file.is_dir():
         parameter_file = parameter_file / "parameters.json"
-    if not parameter_file.is_file():
-        raise UsageError(f"no such file: {parameter_file}")
-    if parameter_file.stat().st_size > MAX_BYTES:
-        raise ParameterError(f"{parameter_file}: larger than {MAX_BYTES} bytes")
-    try:
-        content = strict_json(parameter_file.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ParameterError(f"{parameter_file}: not JSON: {error}") from None
-    _require_document(content, parameter_file)
+    content = read_content(parameter_file)
     table = content["base_parameters"]
     expressions, values = tuple(table["expressions"]), np.array(table["values"], dtype=float)
-    for key, column in table.items():
-        if len(column) != len(expressions):
-            raise ParameterError(f"{parameter_file}: {len(expressions)} expressions but {len(column)} {key}")
     if len(expressions) > MOST_EXPRESSIONS or sum(map(len, expressions)) > MOST_CHARACTERS:
         raise ParameterError(
             f"{parameter_file}: more than {MOST_EXPRESSIONS} expressions, or more than {MOST_CHARACTERS} characters in "
@@ -231,6 +219,29 @@ def read_parameters(
     except ParameterError as error:
         raise ParameterError(f"{parameter_file}: {error}") from None
     return ParameterFile(base, values, content.get("feasible_set"), content, notes)
+
+
+def read_content(parameter_file: Path) -> dict[str, Any]:
+    """Read a parameter file, check its schema and that its columns are equally long; expressions are not parsed.
+
+    Raises:
+        UsageError: no such file.
+        ParameterError: too large, not JSON, not of the schema, or columns of different lengths.
+    """
+    if not parameter_file.is_file():
+        raise UsageError(f"no such file: {parameter_file}")
+    if parameter_file.stat().st_size > MAX_BYTES:
+        raise ParameterError(f"{parameter_file}: larger than {MAX_BYTES} bytes")
+    try:
+        content = strict_json(parameter_file.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ParameterError(f"{parameter_file}: not JSON: {error}") from None
+    _require_document(content, parameter_file)
+    expressions = content["base_parameters"]["expressions"]
+    for key, column in content["base_parameters"].items():
+        if len(column) != len(expressions):
+            raise ParameterError(f"{parameter_file}: {len(expressions)} expressions but {len(column)} {key}")
+    return dict(content)
 
 
 def _notes(expressions: tuple[str, ...], notation: Notation) -> tuple[str, ...]:
@@ -263,6 +274,11 @@ def parameters_document(estimate: Estimate, described: ArmConfig | None = None) 
     Raises:
         SolverError: no proof was found where the solver should have led to one.
     """
+    # These load for half a second, and whoever lists runs only reads files.
+    from ident_service.estimation.certificate import certify
+    from ident_service.results.assessment import error_document
+    from ident_service.results.summary import how_fitted, implausible_links, torque_constants_document
+
     model, base = estimate.model, estimate.base
     errors = error_document(estimate)
     certificate = certify(estimate.beta, base, estimate.conditions, estimate.delta)

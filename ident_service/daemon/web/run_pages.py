@@ -102,10 +102,10 @@ def identified_set(service: Service, run: str) -> IdentifiedSet | None:
 def _identified(path: Path, sha256: str) -> IdentifiedSet:
     # Imported only when a set is shown, so that the service starts without these modules.
     from ident_service.results.assessment import assess
-    from ident_service.results.parameter_file import read_parameters
+    from ident_service.results.parameter_file import read_content
 
     del sha256  # part of the key
-    content = read_parameters(path).content
+    content = read_content(path)
     found, table = assess(content), content["base_parameters"]
     number = len(table["expressions"])
     return IdentifiedSet(
