@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from ident_service.estimation.target import Target
     from ident_service.excitation.motion_file import Excitation
     from ident_service.motion.run_plan import Destination
+    from ident_service.motion.ticket import Ticket
 
 
 # A terminal tells of keys that are pressed, never of keys that are released: a held key is one that repeats. Keyboards
@@ -162,14 +163,11 @@ def run_and_report(
     """
     from ident_service.excitation.motion_file import Excitation
     from ident_service.motion.command_channel import LEASE_SECONDS
-    from ident_service.motion.ticket import read_ticket
     from ident_service.operations.motion_run import run_motion
-    from ident_service.registry.state_folder import new_run_folder, ticket_path
+    from ident_service.registry.state_folder import new_run_folder
 
     state = writable_state_folder(arguments)
-    path = ticket_path(state, config.name)
-    if not path.exists():
-        raise MotionRefused(f"{config.name}: no preflight ticket; run `ident preflight` first")
+    ticket = _ticket(state, config.name)
     folder = arguments.out or new_run_folder(state, config.name)
     begun = False
 
@@ -200,7 +198,7 @@ def run_and_report(
             motion,
             folder,
             state,
-            read_ticket(path),
+            ticket,
             speed=speed,
             lease_seconds=LEASE_SECONDS if lease_seconds is None else lease_seconds,
             log_frames=arguments.can_log,
@@ -220,6 +218,17 @@ def run_and_report(
     # A requested stop is no fault, but the motion was not completed.
     code = DONE if ran.report["state"] == "done" else FAILED
     return code, text, {"folder": str(folder), "files": files, "report": ran.report}
+
+
+def _ticket(state: Path, arm: str) -> Ticket:
+    """Return the ticket of an arm's last preflight; raise MotionRefused without one."""
+    from ident_service.motion.ticket import read_ticket
+    from ident_service.registry.state_folder import ticket_path
+
+    path = ticket_path(state, arm)
+    if not path.exists():
+        raise MotionRefused(f"{arm}: no preflight ticket; run `ident preflight` first")
+    return read_ticket(path)
 
 
 def _add_facts(error: IdentError, folder: Path, state: Path, arm: str) -> None:
@@ -634,6 +643,7 @@ def _hold_to_run(arguments: argparse.Namespace, share_of_speed: float) -> Answer
     terminal = require_terminal(arguments)
     config = described_arm(arguments)
     motion = _chosen(config, arguments.motion)
+    _ticket(writable_state_folder(arguments), config.name)  # before a person holds a key for nothing
     sentence = f"{motion.name} motion of {motion.duration / share_of_speed:g} s while the space bar is held"
     stopping = StopOnSignal()
     with stopping, HeldKey(terminal) as key:

@@ -28,6 +28,17 @@ def test_an_arm_that_moves_is_neither_checked_nor_watched(ident: Ident, state: P
     assert not (state / "arms" / "planar2" / "ticket.json").exists()
 
 
+@pytest.mark.parametrize("verb", ["check", "watch"])
+def test_an_arm_of_which_nobody_can_tell_whether_it_moves_is_not_opened(ident: Ident, state: Path, verb: str) -> None:
+    path = control_path(state, "planar2")
+    path.parent.mkdir(parents=True, mode=0o700)
+    state.chmod(0o700)
+    path.symlink_to(path)
+    ended = ident(verb, "planar2", "--json")
+    assert ended.code == 1
+    assert "it cannot be told whether the arm moves" in ended.json["error"]["message"]
+
+
 @pytest.mark.slow
 def test_a_run_of_an_arm_that_another_process_has_leaves_no_folder(ident: Ident, state: Path, tmp_path: Path) -> None:
     arm = quick_arm(tmp_path, *COARSE)

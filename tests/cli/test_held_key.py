@@ -201,6 +201,17 @@ def test_a_target_of_accuracy_is_for_a_run_without_the_key(tmp_path: Path, capsy
     assert "without --hold-to-run" in capsys.readouterr().err
 
 
+def test_without_a_ticket_nobody_holds_the_key_for_nothing(
+    keyboard: Keyboard, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with os.fdopen(os.dup(keyboard.slave)) as stdin:
+        monkeypatch.setattr("sys.stdin", stdin)
+        assert main(["run", "--hold-to-run", str(arm(tmp_path)), "--state", str(tmp_path / "state")]) == 3
+    printed = capsys.readouterr()
+    assert "no preflight ticket; run `ident preflight` first" in printed.err
+    assert "space bar" not in printed.out + printed.err
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("words", [["run", "--hold-to-run"], pytest.param(["rehearse"], marks=pytest.mark.campaign)])
 def test_a_rehearsal_ends_with_the_key(
