@@ -37,6 +37,7 @@ Preflight moves an arm by a few centimetres. Whatever goes wrong in it, and a st
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import mmap
 import os
@@ -161,13 +162,15 @@ class ControlFile:
             motion_requested_ns: time of the motion's request on that clock [ns]; when None, no earlier stop counts.
 
         Raises:
-            DriverError: another process moves the arm.
+            DriverError: another process moves the arm, or the file is there and cannot be opened.
             UsageError: the file cannot be made.
         """
         try:
             control_file.parent.mkdir(parents=True, exist_ok=True)
             fd = os.open(control_file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         except OSError as error:
+            if os.path.lexists(control_file):
+                raise _unreachable(control_file, error) from None
             raise UsageError(f"{control_file}: cannot be made: {error.strerror}; give another state folder") from None
         if not _locked(fd):
             pid = _pid_in(fd)
@@ -390,6 +393,8 @@ def is_control_file_in_use(control_file: Path) -> bool:
         DriverError: the file cannot be opened, so that nobody can tell.
     """
     try:
+        if control_file.is_dir():  # a folder can be opened for reading
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         fd = os.open(control_file, os.O_RDONLY | os.O_CLOEXEC)
     except (FileNotFoundError, NotADirectoryError):
         return False

@@ -23,8 +23,8 @@ Array = NDArray[np.float64]
 SATURATED: Final = 0.999  # of the limit
 PLATEAU: Final = 5  # so many samples in a row exactly at the extreme value look like a limit where none is known
 # Read in whole steps, a wave that turns round in its largest step is in the step below, just before and after, for at
-# least 0.41 of that time; one that is cut off four steps or more below its top, for less than 0.15.
-_BELOW_A_PLATEAU: Final = 0.15
+# least 0.41 of that time; one that is cut off two steps or more below its top, for less than 0.23.
+_BELOW_A_PLATEAU: Final = 0.25
 STANDSTILL: Final = 0.005  # [rad/s or m/s]
 STANDSTILL_OVER: Final = 0.02  # [s]
 MUCH_JITTER: Final = 0.05  # of a period, standard deviation

@@ -97,8 +97,18 @@ def test_the_round_top_of_a_slow_wave_in_coarse_steps_is_no_saturation(step: flo
     assert cut.saturated == pytest.approx(float((torque[:, 1] == torque[:, 1].max()).mean()), rel=0.2)
 
 
+def test_humps_that_are_cut_a_few_steps_below_their_tops_are_saturated() -> None:
+    """Of a wave whose humps are from 0 to 6 steps higher than where it is cut, with noise."""
+    height = np.repeat(np.linspace(15.0, 18.0, 20), 500)
+    wave = height * np.sin(2 * np.pi * MILLISECONDS * 1e-9 / 0.5)
+    wave += 0.05 * np.random.default_rng(3).normal(size=len(wave))
+    torque = np.round(np.minimum(wave, 15.0) / 0.5) * 0.5
+    found = quality(MadeRecording(MILLISECONDS, np.arange(10_000)[:, None] * 1e-3, torque[:, None]), PLAIN).joints[0]
+    assert found.clipped == pytest.approx(float((torque == 15.0).mean()), rel=0.15)
+
+
 @pytest.mark.parametrize("samples", [4096, 37, 1])
-def test_humps_that_end_a_step_below_the_others_hide_no_saturation(
+def test_humps_that_end_that_end_a_step_below_the_others_hide_no_saturation(
     samples: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Waves of growing height: some end in the step below that at which the higher ones are cut."""

@@ -12,7 +12,7 @@ from ident_service.cli import main
 from ident_service.errors import DriverError, UsageError
 from ident_service.motion.command_channel import ControlFile, is_control_file_in_use, stop_requested_ns
 from ident_service.operations.moving_arms import ask_arm, is_held, moving_arms, stop_arms
-from ident_service.registry.state_folder import control_path
+from ident_service.registry.state_folder import arm_fault_store, control_path
 
 
 class Time:
@@ -162,6 +162,10 @@ def test_an_arm_whose_controls_cannot_be_opened_is_not_said_to_be_at_rest(
         ControlFile.stop_motions(blocked)
     with pytest.raises(DriverError, match="cannot be opened: Is a directory"):
         ControlFile.reach(blocked)
+    with pytest.raises(DriverError, match=r"cannot be opened: Is a directory.* then make it a file"):
+        ControlFile.take(blocked, None)  # another state folder would be another lock
+    with pytest.raises(DriverError, match="cannot be opened: Is a directory"):
+        arm_fault_store(state, "unknown").latched()
     with ControlFile.take(control_path(state, "moving"), None) as loop:
         reached, failures = stop_arms(state, None)
         assert reached == ["moving"]
