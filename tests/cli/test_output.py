@@ -47,7 +47,7 @@ def test_a_closed_stdout_changes_nothing() -> None:
 
 
 def test_no_file_of_ours_takes_the_place_of_a_closed_stream(tmp_path: Path) -> None:
-    """Children print into what has its number, and the recorder is told its memory by numbers."""
+    """A file of ours that got the number of a closed stream would receive what a child process prints."""
     verb = "import os, sys, ident_service.cli as cli; cli.main(['completion', 'bash'])"
     code = f"{verb}; sys.exit(os.open('{tmp_path}', os.O_RDONLY))"
     for closed in (">&-", "2>&-", "<&- >&- 2>&-"):

@@ -130,7 +130,7 @@ def test_buses_and_descriptions(daemon: Asked, state: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["wam7_pucks", "wam7_canopen"])
-def test_two_arms_on_one_bus_move_one_after_the_other(name: str) -> None:
+def test_a_motion_reserves_the_bus_of_its_arm(name: str) -> None:
     config = load_arm(name)
     assert resources(config) == (f"arm {name}", "bus socketcan can0")
 

@@ -98,7 +98,7 @@ def test_the_round_top_of_a_slow_wave_in_coarse_steps_is_no_saturation(step: flo
 
 
 def test_humps_that_are_cut_a_few_steps_below_their_tops_are_saturated() -> None:
-    """Of a wave whose humps are from 0 to 6 steps higher than where it is cut, with noise."""
+    """The humps of a wave with noise, each 0 to 6 steps higher than the torque at which all are cut."""
     height = np.repeat(np.linspace(15.0, 18.0, 20), 500)
     wave = height * np.sin(2 * np.pi * MILLISECONDS * 1e-9 / 0.5)
     wave += 0.05 * np.random.default_rng(3).normal(size=len(wave))

@@ -399,7 +399,7 @@ def test_the_list_says_what_an_arm_is_and_what_comes_next(daemon: Asked, commiss
 
 
 def test_an_arm_whose_control_file_cannot_be_opened_says_what_to_do(daemon: Asked) -> None:
-    """The list shows the others, too."""
+    """One such arm does not keep the list from showing the others."""
     enter(daemon, "viewer")
     assert daemon.get("/api/v1/arms/threelink").json()["control_problem"] is None
     path = control_path(daemon.service.state, "threelink")
